@@ -1,0 +1,72 @@
+//! How a participant joins a run: a request, answered once.
+
+use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
+
+use crate::record;
+
+/// [`AttachRequest::wanted_index`]: any free index will do.
+pub const ANY_INDEX: u16 = u16::MAX;
+/// [`AttachRequest::scenario_hash`]: no scenario of one's own, take the world's.
+pub const ANY_SCENARIO: u64 = 0;
+
+/// [`AttachReply::status`]: welcome; the other fields and the scenario bytes are valid.
+pub const ATTACH_ACCEPTED: u32 = 0;
+/// [`AttachReply::status`]: the participant's schema hash is not the world's.
+pub const ATTACH_OTHER_SCHEMA: u32 = 1;
+/// [`AttachReply::status`]: the participant's scenario hash is not the world's.
+pub const ATTACH_OTHER_SCENARIO: u32 = 2;
+/// [`AttachReply::status`]: every index of that role is taken.
+pub const ATTACH_NO_ROOM: u32 = 3;
+/// [`AttachReply::status`]: the request names a role no participant has.
+pub const ATTACH_BAD_ROLE: u32 = 4;
+
+record! {
+    /// Participant → world: let me in.
+    ///
+    /// Repeated until answered. `instance` is drawn at random by the participant and tells its
+    /// answer from those to others.
+    #[type_name("cz.AttachRequest.v1")]
+    pub struct AttachRequest {
+        /// Random number that names this participant.
+        pub instance: u64,
+        /// The participant's schema hash.
+        pub schema_hash: u64,
+        /// Hash of the scenario the participant was given, or 0 to take the world's.
+        pub scenario_hash: u64,
+        /// Process id, for liveness checks and messages.
+        pub process_id: u32,
+        /// 2 coordinator, 3 controller.
+        pub role: u16,
+        /// Index wanted among the processes of the role, or 65535 for any.
+        pub wanted_index: u16,
+    }
+}
+
+record! {
+    /// World → participant: the answer. The payload of the frame is the encoded scenario.
+    #[type_name("cz.AttachReply.v1")]
+    pub struct AttachReply {
+        /// The `instance` of the request this answers.
+        pub instance: u64,
+        /// Run id for all frames.
+        pub run_id: u64,
+        /// The world's schema hash.
+        pub schema_hash: u64,
+        /// The world's scenario hash.
+        pub scenario_hash: u64,
+        /// First step the participant will be asked to answer.
+        pub first_step: u64,
+        /// 0 accepted, otherwise why not.
+        pub status: u32,
+        /// The world's process id.
+        pub world_process_id: u32,
+        /// Generation the participant is to put in its headers.
+        pub generation: u32,
+        /// Index assigned among the processes of the role.
+        pub index: u32,
+        /// Number of coordinator processes in the run.
+        pub coordinators: u32,
+        /// Number of controller processes in the run.
+        pub controllers: u32,
+    }
+}

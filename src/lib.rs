@@ -1,0 +1,4 @@
+//! Control Zones: safe, optimal coordination of connected automated vehicles through networks of
+//! control zones, as a lockstep multi-process runtime.
+
+pub mod scenario;

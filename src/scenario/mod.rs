@@ -1,0 +1,53 @@
+//! What is to be simulated: the network, its demand, and the parameters of vehicles and controllers.
+//!
+//! A [`Scenario`] is validated: every value in it is finite and within its stated range, every index
+//! points at something, and the network is acyclic. Nothing downstream checks these again.
+
+pub mod demand;
+pub mod network;
+pub mod params;
+
+pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
+pub use network::{Approach, Exit, Network, Road, Source, Zone, ZoneId};
+pub use params::{
+    Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
+    Segment, Solver, VehicleParams,
+};
+
+use serde::{Deserialize, Serialize};
+
+/// A complete, validated scenario.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Scenario {
+    /// Name shown in tables and summaries.
+    pub name: String,
+    /// Seed of all random streams.
+    pub seed: u64,
+    /// Step length, ns. Simulated time is `step * dt_ns`.
+    pub dt_ns: u64,
+    /// Arrivals after this many vehicles are not generated (over all roads, in order of arrival).
+    pub max_vehicles: Option<u32>,
+    /// The run ends at this instant at the latest, s. It ends earlier when all demand has arrived
+    /// and every vehicle has left.
+    pub max_time_s: f64,
+    /// Zones, roads and how they hang together.
+    pub network: Network,
+    /// Vehicle limits and the safety distances.
+    pub vehicle: VehicleParams,
+    /// The controllers' law.
+    pub control: ControlParams,
+    /// Weight of time against energy, m^2/s^4 (paper: beta in `eqn:energyobj`).
+    pub beta: f64,
+}
+
+impl Scenario {
+    /// The step length in seconds.
+    pub fn dt_s(&self) -> f64 {
+        self.dt_ns as f64 * 1e-9
+    }
+
+    /// Simulated time of a step in seconds, from integer nanoseconds.
+    pub fn time_s(&self, step: u64) -> f64 {
+        (step * self.dt_ns) as f64 * 1e-9
+    }
+}

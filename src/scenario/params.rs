@@ -1,0 +1,169 @@
+//! Parameters of vehicles, controllers and flow policies.
+
+use serde::{Deserialize, Serialize};
+
+/// Limits every vehicle obeys, and the distances it keeps.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct VehicleParams {
+    /// Strongest braking, m/s^2, negative.
+    pub u_min_mps2: f64,
+    /// Strongest acceleration, m/s^2, positive.
+    pub u_max_mps2: f64,
+    /// Least speed, m/s, >= 0.
+    pub v_min_mps: f64,
+    /// Greatest speed, m/s.
+    pub v_max_mps: f64,
+    /// Vehicle length, m. Only decides when an arrival would overlap another vehicle.
+    pub length_m: f64,
+    /// Reaction time, s (paper: phi in `Safety`).
+    pub reaction_time_s: f64,
+    /// Standstill gap, centre to centre, m (paper: delta).
+    pub standstill_gap_m: f64,
+}
+
+/// Which necessary condition the reference trajectory satisfies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ReferenceLaw {
+    /// beta - b^2/2 + a c = 0, the correct transversality condition (quartic in T).
+    Corrected,
+    /// beta - b/2 + a c = 0 as the paper prints it (cubic in T), for reproduction.
+    AsPrinted,
+}
+
+/// Where a new plan starts when the terminal speed changes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Replan {
+    /// The plan from the entry is perturbed (paper: `equ:delta_t`).
+    FromEntry,
+    /// A new plan from the vehicle's position and speed.
+    FromState,
+}
+
+/// How the reference time is found from the position.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PositionFeedback {
+    /// One Newton step: `t - (x*(t) - x) / v*(t)`.
+    Approximate,
+    /// The root of `x*(t_ref) = x`.
+    Exact,
+}
+
+/// Who solves the QP of `equ:ocbf_qp`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Solver {
+    /// The exact closed form.
+    ClosedForm,
+    /// The Clarabel interior-point solver, as reference.
+    Clarabel,
+}
+
+/// Which conditions keep a vehicle in feasibility-enforcement mode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FeConditions {
+    /// Barriers non-negative, rows satisfiable at u_min, and what the feasibility rows keep invariant.
+    Full,
+    /// Only the barriers.
+    Barrier,
+    /// There is no FE mode.
+    Off,
+}
+
+/// The form of the safety rows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SafetyRows {
+    /// The continuous-time barrier rows of the paper.
+    Continuous,
+    /// The rear-end row for a command held over the step, with the partner's last acceleration.
+    Sampled,
+}
+
+/// The controllers' law.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ControlParams {
+    /// Transversality condition of the reference.
+    pub reference: ReferenceLaw,
+    /// Where re-planning starts.
+    pub replan: Replan,
+    /// Reference time from position.
+    pub position_feedback: PositionFeedback,
+    /// QP solver.
+    pub solver: Solver,
+    /// Form of the safety rows.
+    pub safety_rows: SafetyRows,
+    /// Rear-end barrier gain k1, 1/s.
+    pub k_rear_end_per_s: f64,
+    /// Merging barrier gain k2, 1/s.
+    pub k_merge_per_s: f64,
+    /// Speed barrier gain k_v, 1/s.
+    pub k_speed_per_s: f64,
+    /// CLF rate epsilon, 1/s.
+    pub clf_rate_per_s: f64,
+    /// Weight lambda of the squared slack.
+    pub slack_weight: f64,
+    /// Whether the CLF row is present.
+    pub clf: bool,
+    /// Whether the feasibility rows (`equ:candidate`, `equ:candidate2`) are present.
+    pub feasibility_rows: bool,
+    /// Entry conditions of FE mode.
+    pub fe_conditions: FeConditions,
+    /// Fraction of the approach within which FE mode may act (paper: L/4).
+    pub fe_fraction: f64,
+}
+
+/// Baseline speed v_b of a feedback policy.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Baseline {
+    /// A given speed, m/s.
+    Given(f64),
+    /// The mean, over these entry speeds in m/s, of the terminal speed that minimises the cost.
+    Optimal(Vec<f64>),
+}
+
+/// Which part of the downstream zone a policy observes.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub enum Segment {
+    /// The whole zone: N.
+    Whole,
+    /// Its first metres: N(l).
+    First(f64),
+}
+
+/// How a coordinator sets the terminal speed v_m (paper: `equ:feedback_control`).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub enum FlowPolicy {
+    /// No flow control: the terminal speed is free.
+    None,
+    /// v_m is constant.
+    Fixed {
+        /// Terminal speed, m/s.
+        terminal_mps: f64,
+    },
+    /// v_m = v_b - k N, with N counted in the downstream zone or its first metres.
+    Feedback {
+        /// Baseline speed v_b.
+        baseline: Baseline,
+        /// Gain k, m/s per vehicle.
+        gain_mps: f64,
+        /// Where vehicles are counted.
+        segment: Segment,
+        /// v_m is not set lower, m/s.
+        min_mps: f64,
+    },
+    /// v_m = mean speed in the first l metres downstream + offset - k N(l); free while it is empty.
+    MeanSpeed {
+        /// Offset on the mean speed, m/s.
+        offset_mps: f64,
+        /// Gain k, m/s per vehicle.
+        gain_mps: f64,
+        /// Length l, m.
+        segment_m: f64,
+        /// v_m is not set lower, m/s.
+        min_mps: f64,
+    },
+}
