@@ -1,4 +1,6 @@
 //! Control Zones: safe, optimal coordination of connected automated vehicles through networks of
 //! control zones, as a lockstep multi-process runtime.
 
+pub mod control;
 pub mod scenario;
+pub mod vehicle;

@@ -1,0 +1,14 @@
+//! One vehicle's controller: reference trajectory, barrier rows, QP, feasibility-enforcement mode.
+//!
+//! Everything here is a pure function of what the state and coordination frames carry.
+
+pub mod clarabel;
+pub mod law;
+pub mod pool;
+pub mod qp;
+pub mod reference;
+pub mod rows;
+
+pub use law::{Decision, Law, Memory, Mode, Partner, PartnerKind, Situation, Verdict};
+pub use pool::ControllerPool;
+pub use reference::{Optimum, Reference, Terminal};

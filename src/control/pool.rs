@@ -1,0 +1,306 @@
+//! The controller role: the vehicles of some zones, from state and coordination frames to commands.
+
+use super::law::{Law, Memory, Mode, Partner, PartnerKind, Situation, Verdict};
+use super::reference::{Reference, Terminal};
+use crate::scenario::{Scenario, ZoneId};
+use ipc_schemas::{self as frames, Assignment, VehicleCommand, VehicleState};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Drives the vehicles of a contiguous range of zones with the built-in law.
+#[derive(Debug)]
+pub struct ControllerPool {
+    scenario: Arc<Scenario>,
+    law: Law,
+    zones: Range<ZoneId>,
+    crews: Vec<Crew>,
+}
+
+/// The vehicles of one zone, aligned with the zone's members in the state frame.
+#[derive(Debug, Default)]
+struct Crew {
+    members: Vec<Member>,
+    constraints: Vec<Constraint>,
+    /// The previous crew while a new one is built; kept for its allocation.
+    retired: Vec<Member>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Member {
+    vehicle: u32,
+    terminal: Terminal,
+    memory: Memory,
+    /// Range in [`Crew::constraints`].
+    first_constraint: u32,
+    end_constraint: u32,
+}
+
+/// An assignment, resolved to a place in the zone's slice of the state frame. The slice keeps its
+/// shape until the zone's next event, and with that event come new assignments.
+#[derive(Clone, Copy, Debug)]
+struct Constraint {
+    kind: PartnerKind,
+    partner_at: u32,
+    /// Added to the partner's position to express it in the vehicle's coordinate, m.
+    shift_m: f64,
+    conflict_m: f64,
+}
+
+/// A frame that contradicts the protocol.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum PoolError {
+    /// A zone's membership changed and its coordinator said nothing.
+    #[error("zone {zone} has {present} vehicles but its coordinator assigned {assigned}")]
+    Unassigned {
+        /// The zone.
+        zone: ZoneId,
+        /// Vehicles in the state frame.
+        present: usize,
+        /// Vehicles in the coordination in force.
+        assigned: usize,
+    },
+    /// An assignment names a vehicle that is not in the zone.
+    #[error("an assignment in zone {zone} names vehicle {vehicle}, which is not there")]
+    UnknownVehicle {
+        /// The zone.
+        zone: ZoneId,
+        /// The vehicle.
+        vehicle: u32,
+    },
+    /// An assignment has a kind no constraint has, or distances that are not positive numbers.
+    #[error("an assignment of vehicle {vehicle} in zone {zone} is malformed")]
+    Malformed {
+        /// The zone.
+        zone: ZoneId,
+        /// The vehicle.
+        vehicle: u32,
+    },
+}
+
+impl ControllerPool {
+    /// A pool for the given zones.
+    pub fn new(scenario: Arc<Scenario>, zones: Range<ZoneId>) -> ControllerPool {
+        let crews = zones.clone().map(|_| Crew::default()).collect();
+        ControllerPool { law: Law::new(&scenario), scenario, zones, crews }
+    }
+
+    /// The number of commands a state frame asks of this pool.
+    pub fn command_count(&self, states: &[VehicleState]) -> usize {
+        self.own(states).iter().filter(|s| s.flags & frames::STATE_LEFT == 0).count()
+    }
+
+    /// Takes a coordination frame; assignments of other pools' zones are skipped.
+    pub fn coordinate(
+        &mut self,
+        states: &[VehicleState],
+        assignments: &[Assignment],
+    ) -> Result<(), PoolError> {
+        for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
+            let zone = group[0].zone;
+            if self.zones.contains(&zone) {
+                let from = states.partition_point(|s| s.zone < zone);
+                let to = from + states[from..].partition_point(|s| s.zone == zone);
+                self.crews[(zone - self.zones.start) as usize].assign(zone, &states[from..to], group)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Decides every vehicle of the pool's zones; `emit` receives the commands in frame order.
+    pub fn command(
+        &mut self,
+        time_s: f64,
+        states: &[VehicleState],
+        mut emit: impl FnMut(VehicleCommand),
+    ) -> Result<(), PoolError> {
+        let range = self.own_range(states);
+        for slice in states[range].chunk_by(|a, b| a.zone == b.zone) {
+            let zone = slice[0].zone;
+            let approaches = &self.scenario.network.zones[zone as usize].approaches;
+            let crew = &mut self.crews[(zone - self.zones.start) as usize];
+            let members = &slice[usize::from(slice[0].flags & frames::STATE_LEFT != 0)..];
+            if members.is_empty() {
+                continue;
+            }
+            let unassigned =
+                PoolError::Unassigned { zone, present: members.len(), assigned: crew.members.len() };
+            if members.len() != crew.members.len() {
+                return Err(unassigned);
+            }
+            for (state, member) in members.iter().zip(&mut crew.members) {
+                if state.vehicle != member.vehicle {
+                    return Err(unassigned);
+                }
+                let situation = Situation {
+                    time_s,
+                    x_m: state.x_m,
+                    v_mps: state.v_mps,
+                    entry_time_s: state.entry_time_s,
+                    entry_speed_mps: state.entry_speed_mps,
+                    length_m: approaches[state.path as usize].length_m,
+                    terminal: member.terminal,
+                };
+                let constraints =
+                    &crew.constraints[member.first_constraint as usize..member.end_constraint as usize];
+                let partners = constraints.iter().map(|c| {
+                    let partner = &slice[c.partner_at as usize];
+                    Partner {
+                        kind: c.kind,
+                        x_m: partner.x_m + c.shift_m,
+                        v_mps: partner.v_mps,
+                        u_mps2: partner.u_mps2,
+                        conflict_m: c.conflict_m,
+                    }
+                });
+                let decision = self.law.decide(&situation, partners, &mut member.memory);
+                emit(command(state, &decision, &member.memory));
+            }
+        }
+        Ok(())
+    }
+
+    fn own_range(&self, states: &[VehicleState]) -> Range<usize> {
+        let from = states.partition_point(|s| s.zone < self.zones.start);
+        from..from + states[from..].partition_point(|s| s.zone < self.zones.end)
+    }
+
+    fn own<'a>(&self, states: &'a [VehicleState]) -> &'a [VehicleState] {
+        &states[self.own_range(states)]
+    }
+}
+
+impl Crew {
+    /// Rebuilds the crew from the zone's slice and its assignments; memories are kept by vehicle.
+    fn assign(
+        &mut self,
+        zone: ZoneId,
+        slice: &[VehicleState],
+        assignments: &[Assignment],
+    ) -> Result<(), PoolError> {
+        std::mem::swap(&mut self.members, &mut self.retired);
+        self.members.clear();
+        self.constraints.clear();
+        let mut groups = assignments.chunk_by(|a, b| a.vehicle == b.vehicle);
+        let mut known = self.retired.iter().peekable();
+        for state in slice.iter().filter(|s| s.flags & frames::STATE_LEFT == 0) {
+            let group = groups.next().unwrap_or(&[]);
+            if group.first().is_none_or(|a| a.vehicle != state.vehicle) {
+                let present = slice.len();
+                return Err(PoolError::Unassigned { zone, present, assigned: self.members.len() });
+            }
+            // Both lists are in order of entry, so one pass finds every vehicle that stayed.
+            let memory = loop {
+                match known.peek() {
+                    Some(old) if old.vehicle == state.vehicle => break old.memory,
+                    Some(_) if self.retired.iter().any(|m| m.vehicle == state.vehicle) => known.next(),
+                    _ => break Memory::ENTERED,
+                };
+            };
+            let first = self.constraints.len() as u32;
+            for assignment in group {
+                if let Some(constraint) = resolve(slice, assignment)? {
+                    self.constraints.push(constraint);
+                }
+            }
+            let terminal = if group[0].flags & frames::ASSIGNMENT_FREE_TERMINAL != 0 {
+                Terminal::Free
+            } else {
+                Terminal::Speed(group[0].terminal_speed_mps)
+            };
+            self.members.push(Member {
+                vehicle: state.vehicle,
+                terminal,
+                memory,
+                first_constraint: first,
+                end_constraint: self.constraints.len() as u32,
+            });
+        }
+        match groups.next() {
+            Some(group) => Err(PoolError::UnknownVehicle { zone, vehicle: group[0].vehicle }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Turns an assignment into a place in the zone's slice; `None` for one without partner.
+fn resolve(slice: &[VehicleState], a: &Assignment) -> Result<Option<Constraint>, PoolError> {
+    let malformed = PoolError::Malformed { zone: a.zone, vehicle: a.vehicle };
+    let kind = match a.kind {
+        frames::CONSTRAINT_NONE => return Ok(None),
+        frames::CONSTRAINT_REAR_END => PartnerKind::RearEnd,
+        frames::CONSTRAINT_MERGE => PartnerKind::Merge,
+        _ => return Err(malformed),
+    };
+    let sound = a.own_conflict_m > 0.0
+        && a.own_conflict_m.is_finite()
+        && a.partner_conflict_m.is_finite()
+        && a.terminal_speed_mps.is_finite();
+    if !sound {
+        return Err(malformed);
+    }
+    let partner_at = slice
+        .iter()
+        .position(|s| s.vehicle == a.partner)
+        .ok_or(PoolError::UnknownVehicle { zone: a.zone, vehicle: a.partner })?;
+    Ok(Some(Constraint {
+        kind,
+        partner_at: partner_at as u32,
+        shift_m: a.own_conflict_m - a.partner_conflict_m,
+        conflict_m: a.own_conflict_m,
+    }))
+}
+
+/// The wire form of a decision and the memory behind it.
+fn command(state: &VehicleState, decision: &super::Decision, memory: &Memory) -> VehicleCommand {
+    let (verdict, binding_rows) = match decision.verdict {
+        Verdict::Nominal => (frames::VERDICT_NOMINAL, 0),
+        Verdict::Fe => (frames::VERDICT_FE, 0),
+        Verdict::Bound(row) => (frames::VERDICT_BOUND, row as u32),
+        Verdict::Infeasible => (frames::VERDICT_INFEASIBLE, 0),
+    };
+    let mode = match memory.mode {
+        Mode::Fe => frames::MODE_FE,
+        Mode::Ocbf => frames::MODE_OCBF,
+    };
+    let mut command = VehicleCommand {
+        u_mps2: decision.u_mps2,
+        vehicle: state.vehicle,
+        zone: state.zone,
+        binding_rows,
+        mode,
+        verdict,
+        ..VehicleCommand::default()
+    };
+    if let Some(plan) = &memory.plan {
+        command.planned_exit_time_s = plan.exit_time_s();
+        command.planned_exit_speed_mps = plan.exit_speed_mps();
+        command.plan_start_s = plan.start_s;
+        command.plan_origin_m = plan.origin_m;
+        command.plan_v0_mps = plan.v0_mps;
+        command.plan_a = plan.optimum.a;
+        command.plan_b = plan.optimum.b;
+        command.plan_duration_s = plan.optimum.duration_s;
+        command.plan_terminal_mps = match plan.terminal {
+            Terminal::Free => -1.0,
+            Terminal::Speed(w) => w,
+        };
+    }
+    command
+}
+
+/// The memory a command frame carries (the inverse of what [`ControllerPool::command`] writes).
+pub fn memory_of(command: &VehicleCommand) -> Memory {
+    let mode = if command.mode == frames::MODE_OCBF { Mode::Ocbf } else { Mode::Fe };
+    let plan = (command.plan_duration_s > 0.0).then(|| Reference {
+        start_s: command.plan_start_s,
+        origin_m: command.plan_origin_m,
+        v0_mps: command.plan_v0_mps,
+        optimum: super::Optimum { duration_s: command.plan_duration_s, a: command.plan_a, b: command.plan_b },
+        terminal: if command.plan_terminal_mps < 0.0 {
+            Terminal::Free
+        } else {
+            Terminal::Speed(command.plan_terminal_mps)
+        },
+    });
+    Memory { mode, plan }
+}

@@ -1,0 +1,152 @@
+//! Motion over one step with the acceleration held (paper: `VehicleDynamics`).
+
+/// Motion from `(x0, v0)` under a held acceleration, for any time up to one step.
+///
+/// A vehicle that would reverse stops at `v = 0` and stays there; the instant is exact.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Held {
+    /// Position at the start, m.
+    pub x0_m: f64,
+    /// Speed at the start, m/s, >= 0.
+    pub v0_mps: f64,
+    /// Held acceleration, m/s^2.
+    pub u_mps2: f64,
+    /// Time until the vehicle comes to a stop, s; infinite when it never does.
+    stop_s: f64,
+}
+
+impl Held {
+    /// Starts at position `x0_m` with speed `v0_mps >= 0` under acceleration `u_mps2`.
+    pub fn new(x0_m: f64, v0_mps: f64, u_mps2: f64) -> Held {
+        let stop_s = if u_mps2 < 0.0 { v0_mps / -u_mps2 } else { f64::INFINITY };
+        Held { x0_m, v0_mps, u_mps2, stop_s }
+    }
+
+    /// Position after `t_s >= 0`, m.
+    pub fn position_m(&self, t_s: f64) -> f64 {
+        let t = t_s.min(self.stop_s);
+        self.x0_m + (self.v0_mps + 0.5 * self.u_mps2 * t) * t
+    }
+
+    /// Speed after `t_s >= 0`, m/s.
+    pub fn speed_mps(&self, t_s: f64) -> f64 {
+        if t_s >= self.stop_s { 0.0 } else { (self.v0_mps + self.u_mps2 * t_s).max(0.0) }
+    }
+
+    /// Energy spent until `t_s`, the integral of u^2/2 while moving, m^2/s^3.
+    pub fn energy(&self, t_s: f64) -> f64 {
+        0.5 * self.u_mps2 * self.u_mps2 * t_s.min(self.stop_s)
+    }
+
+    /// Acceleration as an observer sees it over `[0, t_s]`: the held one, or the mean when the
+    /// vehicle came to a stop on the way, m/s^2.
+    pub fn observed_mps2(&self, t_s: f64) -> f64 {
+        if t_s > self.stop_s { -self.v0_mps / t_s } else { self.u_mps2 }
+    }
+
+    /// Instant at which the vehicle passes `x_m`, s, if that is within `[0, within_s]`.
+    ///
+    /// The root is taken in the form that does not cancel, so it is exact to rounding.
+    pub fn passes_m(&self, x_m: f64, within_s: f64) -> Option<f64> {
+        let distance = x_m - self.x0_m;
+        if distance <= 0.0 {
+            return Some(0.0);
+        }
+        if self.position_m(within_s) < x_m {
+            return None;
+        }
+        let discriminant = self.v0_mps * self.v0_mps + 2.0 * self.u_mps2 * distance;
+        let root = 2.0 * distance / (self.v0_mps + discriminant.max(0.0).sqrt());
+        Some(root.min(within_s))
+    }
+
+    /// Least value over `[0, within_s]` of `leader - self + shift_m - reaction_s * v - gap_m`, m: the
+    /// rear-end margin between samples as well as at them.
+    pub fn least_margin_m(
+        &self,
+        leader: &Held,
+        shift_m: f64,
+        reaction_s: f64,
+        gap_m: f64,
+        within_s: f64,
+    ) -> f64 {
+        let margin = |t: f64| {
+            leader.position_m(t) - self.position_m(t) + shift_m - reaction_s * self.speed_mps(t) - gap_m
+        };
+        let mut least = margin(0.0).min(margin(within_s));
+        // Between the instants at which one of the two stops, the margin is a parabola.
+        let mut from = 0.0;
+        let (a, b) = if self.stop_s < leader.stop_s {
+            (self.stop_s, leader.stop_s)
+        } else {
+            (leader.stop_s, self.stop_s)
+        };
+        for to in [a.min(within_s), b.min(within_s), within_s] {
+            if to > from {
+                let mid = 0.5 * (from + to);
+                let own_u = if mid < self.stop_s { self.u_mps2 } else { 0.0 };
+                let lead_u = if mid < leader.stop_s { leader.u_mps2 } else { 0.0 };
+                let curvature = lead_u - own_u;
+                let slope = leader.speed_mps(from) - self.speed_mps(from) - reaction_s * own_u;
+                least = least.min(margin(from)).min(margin(to));
+                if curvature > 0.0 {
+                    let vertex = from - slope / curvature;
+                    if vertex > from && vertex < to {
+                        least = least.min(margin(vertex));
+                    }
+                }
+                from = to;
+            }
+        }
+        least
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_braking_vehicle_stops_and_stays() {
+        let held = Held::new(10.0, 2.0, -4.0);
+        assert_eq!(held.position_m(0.5), 10.5);
+        assert_eq!(held.position_m(9.0), 10.5);
+        assert_eq!(held.speed_mps(0.5), 0.0);
+        assert_eq!(held.speed_mps(9.0), 0.0);
+        assert_eq!(held.energy(9.0), 4.0);
+        assert_eq!(held.observed_mps2(1.0), -2.0);
+        assert_eq!(held.passes_m(10.6, 9.0), None);
+    }
+
+    proptest! {
+        #[test]
+        fn crossing_instant_lies_on_the_boundary(
+            v in 0.0..30.0f64, u in -4.0..4.0f64, ahead in 0.0..3.0f64,
+        ) {
+            let held = Held::new(100.0, v, u);
+            match held.passes_m(100.0 + ahead, 0.1) {
+                Some(t) => prop_assert!((held.position_m(t) - (100.0 + ahead)).abs() < 1e-12 * 200.0),
+                None => prop_assert!(held.position_m(0.1) < 100.0 + ahead),
+            }
+        }
+
+        #[test]
+        fn least_margin_is_no_greater_than_any_sample(
+            v in 0.0..30.0f64, u in -4.0..4.0f64, vl in 0.0..30.0f64, ul in -4.0..4.0f64,
+            gap in -5.0..60.0f64, dt in 0.01..2.0f64,
+        ) {
+            let own = Held::new(0.0, v, u);
+            let leader = Held::new(gap, vl, ul);
+            let least = own.least_margin_m(&leader, 0.0, 1.8, 0.5, dt);
+            let mut brute = f64::INFINITY;
+            for i in 0..=4000 {
+                let t = dt * f64::from(i) / 4000.0;
+                let m = leader.position_m(t) - own.position_m(t) - 1.8 * own.speed_mps(t) - 0.5;
+                prop_assert!(m >= least - 1e-9);
+                brute = brute.min(m);
+            }
+            prop_assert!(brute - least < 0.02, "least {least} but brute force found only {brute}");
+        }
+    }
+}
