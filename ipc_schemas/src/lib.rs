@@ -6,6 +6,7 @@
 //! (`cargo run -p ipc_schemas`) and a test fails when they are stale.
 
 mod attach;
+pub mod check;
 pub mod code;
 mod command;
 mod coordination;
@@ -16,6 +17,7 @@ mod state;
 mod summary;
 
 pub use attach::*;
+pub use check::{ExpectedHeader, HeaderFault};
 pub use code::{Code, CodeValue};
 pub use command::*;
 pub use coordination::*;
