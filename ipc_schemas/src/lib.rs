@@ -10,6 +10,7 @@ pub mod check;
 pub mod code;
 mod command;
 mod coordination;
+pub mod generate;
 mod header;
 pub mod record;
 mod services;
