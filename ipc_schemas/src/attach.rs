@@ -2,23 +2,26 @@
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
+use crate::code::codes;
 use crate::record;
 
-/// [`AttachRequest::wanted_index`]: any free index will do.
-pub const ANY_INDEX: u16 = u16::MAX;
-/// [`AttachRequest::scenario_hash`]: no scenario of one's own, take the world's.
-pub const ANY_SCENARIO: u64 = 0;
+codes! {
+    /// [`AttachRequest::wanted_index`]: any free index will do.
+    pub const ANY_INDEX: u16 = u16::MAX;
+    /// [`AttachRequest::scenario_hash`]: no scenario of one's own, take the world's.
+    pub const ANY_SCENARIO: u64 = 0;
 
-/// [`AttachReply::status`]: welcome; the other fields and the scenario bytes are valid.
-pub const ATTACH_ACCEPTED: u32 = 0;
-/// [`AttachReply::status`]: the participant's schema hash is not the world's.
-pub const ATTACH_OTHER_SCHEMA: u32 = 1;
-/// [`AttachReply::status`]: the participant's scenario hash is not the world's.
-pub const ATTACH_OTHER_SCENARIO: u32 = 2;
-/// [`AttachReply::status`]: every index of that role is taken.
-pub const ATTACH_NO_ROOM: u32 = 3;
-/// [`AttachReply::status`]: the request names a role no participant has.
-pub const ATTACH_BAD_ROLE: u32 = 4;
+    /// [`AttachReply::status`]: welcome; the other fields and the scenario bytes are valid.
+    pub const ATTACH_ACCEPTED: u32 = 0;
+    /// [`AttachReply::status`]: the participant's schema hash is not the world's.
+    pub const ATTACH_OTHER_SCHEMA: u32 = 1;
+    /// [`AttachReply::status`]: the participant's scenario hash is not the world's.
+    pub const ATTACH_OTHER_SCENARIO: u32 = 2;
+    /// [`AttachReply::status`]: every index of that role is taken.
+    pub const ATTACH_NO_ROOM: u32 = 3;
+    /// [`AttachReply::status`]: the request names a role no participant has.
+    pub const ATTACH_BAD_ROLE: u32 = 4;
+}
 
 record! {
     /// Participant → world: let me in.

@@ -2,23 +2,26 @@
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
+use crate::code::codes;
 use crate::record;
 
-/// [`VehicleCommand::mode`]: entered, not yet decided on (never sent by the built-in law).
-pub const MODE_ENTERED: u16 = 0;
-/// [`VehicleCommand::mode`]: feasibility-enforcement mode.
-pub const MODE_FE: u16 = 1;
-/// [`VehicleCommand::mode`]: OCBF mode, tracking the reference.
-pub const MODE_OCBF: u16 = 2;
+codes! {
+    /// [`VehicleCommand::mode`]: entered, not yet decided on (never sent by the built-in law).
+    pub const MODE_ENTERED: u16 = 0;
+    /// [`VehicleCommand::mode`]: feasibility-enforcement mode.
+    pub const MODE_FE: u16 = 1;
+    /// [`VehicleCommand::mode`]: OCBF mode, tracking the reference.
+    pub const MODE_OCBF: u16 = 2;
 
-/// [`VehicleCommand::verdict`]: no row binds, the reference is tracked as wished.
-pub const VERDICT_NOMINAL: u16 = 0;
-/// [`VehicleCommand::verdict`]: feasibility-enforcement mode decided the command.
-pub const VERDICT_FE: u16 = 1;
-/// [`VehicleCommand::verdict`]: at least one row of `binding_rows` decided the command.
-pub const VERDICT_BOUND: u16 = 2;
-/// [`VehicleCommand::verdict`]: no command satisfies all rows; `u_min` was sent.
-pub const VERDICT_INFEASIBLE: u16 = 3;
+    /// [`VehicleCommand::verdict`]: no row binds, the reference is tracked as wished.
+    pub const VERDICT_NOMINAL: u16 = 0;
+    /// [`VehicleCommand::verdict`]: feasibility-enforcement mode decided the command.
+    pub const VERDICT_FE: u16 = 1;
+    /// [`VehicleCommand::verdict`]: at least one row of `binding_rows` decided the command.
+    pub const VERDICT_BOUND: u16 = 2;
+    /// [`VehicleCommand::verdict`]: no command satisfies all rows; `u_min` was sent.
+    pub const VERDICT_INFEASIBLE: u16 = 3;
+}
 
 record! {
     /// One vehicle's command for the step, and what its controller must remember.

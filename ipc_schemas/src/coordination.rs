@@ -2,17 +2,20 @@
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
+use crate::code::codes;
 use crate::record;
 
-/// [`Assignment::kind`]: no partner; the record only carries the terminal speed.
-pub const CONSTRAINT_NONE: u16 = 0;
-/// [`Assignment::kind`]: the partner drives ahead on the same path (paper: i_p).
-pub const CONSTRAINT_REAR_END: u16 = 1;
-/// [`Assignment::kind`]: the partner passes the shared conflict point first (paper: i-1).
-pub const CONSTRAINT_MERGE: u16 = 2;
+codes! {
+    /// [`Assignment::kind`]: no partner; the record only carries the terminal speed.
+    pub const CONSTRAINT_NONE: u16 = 0;
+    /// [`Assignment::kind`]: the partner drives ahead on the same path (paper: i_p).
+    pub const CONSTRAINT_REAR_END: u16 = 1;
+    /// [`Assignment::kind`]: the partner passes the shared conflict point first (paper: i-1).
+    pub const CONSTRAINT_MERGE: u16 = 2;
 
-/// [`Assignment::flags`]: the terminal speed is free; `terminal_speed_mps` is 0 and means nothing.
-pub const ASSIGNMENT_FREE_TERMINAL: u16 = 1;
+    /// [`Assignment::flags`]: the terminal speed is free; `terminal_speed_mps` is 0 and means nothing.
+    pub const ASSIGNMENT_FREE_TERMINAL: u16 = 1;
+}
 
 record! {
     /// One constraint of one vehicle, as the zone's coordinator decided it.

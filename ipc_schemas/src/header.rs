@@ -2,27 +2,40 @@
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
+use crate::code::codes;
 use crate::record;
+
+codes! {
+    /// [`FrameHeader::sender_role`]: the world integrator.
+    pub const ROLE_WORLD: u16 = 1;
+    /// [`FrameHeader::sender_role`]: a coordinator process.
+    pub const ROLE_COORDINATOR: u16 = 2;
+    /// [`FrameHeader::sender_role`]: a vehicle-controller process.
+    pub const ROLE_CONTROLLER: u16 = 3;
+
+    /// [`FrameHeader::flags`]: this is the last state frame of the run; answer nothing, detach.
+    pub const FLAG_END_OF_RUN: u32 = 1;
+}
 
 /// Who sent a frame; the value of [`FrameHeader::sender_role`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 #[repr(u16)]
 pub enum Role {
     /// The world integrator.
-    World = 1,
+    World = ROLE_WORLD,
     /// A coordinator process.
-    Coordinator = 2,
+    Coordinator = ROLE_COORDINATOR,
     /// A vehicle-controller process.
-    Controller = 3,
+    Controller = ROLE_CONTROLLER,
 }
 
 impl Role {
     /// The role a header names, or `None` for a value no role has.
     pub fn from_code(code: u16) -> Option<Role> {
         match code {
-            1 => Some(Role::World),
-            2 => Some(Role::Coordinator),
-            3 => Some(Role::Controller),
+            ROLE_WORLD => Some(Role::World),
+            ROLE_COORDINATOR => Some(Role::Coordinator),
+            ROLE_CONTROLLER => Some(Role::Controller),
             _ => None,
         }
     }
@@ -37,9 +50,6 @@ impl core::fmt::Display for Role {
         })
     }
 }
-
-/// [`FrameHeader::flags`]: this is the last state frame of the run; answer nothing, detach.
-pub const FLAG_END_OF_RUN: u32 = 1;
 
 record! {
     /// Precedes the records of every frame, whatever its type.

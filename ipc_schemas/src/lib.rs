@@ -6,8 +6,11 @@
 //! (`cargo run -p ipc_schemas`) and a test fails when they are stale.
 
 mod attach;
+pub mod check;
+pub mod code;
 mod command;
 mod coordination;
+pub mod generate;
 mod header;
 pub mod record;
 mod services;
@@ -15,6 +18,8 @@ mod state;
 mod summary;
 
 pub use attach::*;
+pub use check::{ExpectedHeader, HeaderFault};
+pub use code::{Code, CodeValue};
 pub use command::*;
 pub use coordination::*;
 pub use header::*;
@@ -36,6 +41,13 @@ pub const LAYOUTS: [Layout; 7] = [
     AttachRequest::LAYOUT,
     AttachReply::LAYOUT,
 ];
+
+/// All public codes, flags and service names, one table per module that declares some.
+///
+/// Not part of the schema hash: a new code does not change a layout. Changing the meaning of an old one
+/// is a new version of the record that carries it.
+pub const CODES: [&[Code]; 6] =
+    [header::CODES, state::CODES, coordination::CODES, command::CODES, attach::CODES, services::CODES];
 
 /// The canonical text of the schema: one line per record and field.
 pub fn schema_text() -> String {

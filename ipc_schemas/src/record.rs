@@ -1,6 +1,6 @@
 //! How a record is declared once and described everywhere.
 //!
-//! [`record!`](crate::record) turns one Rust struct into the layout every other language is held to:
+//! [`record!`](macro@crate::record) turns one Rust struct into the layout every other language is held to:
 //! the struct itself (`#[repr(C)]`), its [`Layout`] for the generators and the schema hash, and a
 //! compile-time proof that it has no padding.
 

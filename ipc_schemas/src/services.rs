@@ -1,16 +1,20 @@
 //! The names of the services of a run. One transport prefix isolates a run, so the names are fixed.
 
-/// World → controllers: [`VehicleState`](crate::VehicleState) of every step.
-pub const SERVICE_STATE: &str = "cz/state";
-/// World → coordinators: [`VehicleState`](crate::VehicleState), only of the steps they act in.
-pub const SERVICE_COORDINATOR_STATE: &str = "cz/coordinator-state";
-/// Coordinators → controllers: [`Assignment`](crate::Assignment) of the steps they act in.
-pub const SERVICE_COORDINATION: &str = "cz/coordination";
-/// Coordinators → coordinator `i`: [`ZoneSummary`](crate::ZoneSummary); `i` is appended.
-pub const SERVICE_SUMMARY_PREFIX: &str = "cz/summary/";
-/// Controllers → world: [`VehicleCommand`](crate::VehicleCommand) of every step.
-pub const SERVICE_COMMAND: &str = "cz/command";
-/// Participants → world: [`AttachRequest`](crate::AttachRequest).
-pub const SERVICE_ATTACH: &str = "cz/attach";
-/// World → participants: bytes behind an [`AttachReply`](crate::AttachReply).
-pub const SERVICE_ATTACH_REPLY: &str = "cz/attach-reply";
+use crate::code::codes;
+
+codes! {
+    /// World → controllers: [`VehicleState`](crate::VehicleState) of every step.
+    pub const SERVICE_STATE: &str = "cz/state";
+    /// World → coordinators: [`VehicleState`](crate::VehicleState), only of the steps they act in.
+    pub const SERVICE_COORDINATOR_STATE: &str = "cz/coordinator-state";
+    /// Coordinators → controllers: [`Assignment`](crate::Assignment) of the steps they act in.
+    pub const SERVICE_COORDINATION: &str = "cz/coordination";
+    /// Coordinators → coordinator `i`: [`ZoneSummary`](crate::ZoneSummary); `i` is appended.
+    pub const SERVICE_SUMMARY_PREFIX: &str = "cz/summary/";
+    /// Controllers → world: [`VehicleCommand`](crate::VehicleCommand) of every step.
+    pub const SERVICE_COMMAND: &str = "cz/command";
+    /// Participants → world: [`AttachRequest`](crate::AttachRequest).
+    pub const SERVICE_ATTACH: &str = "cz/attach";
+    /// World → participants: the scenario as bytes, behind the [`AttachReply`](crate::AttachReply).
+    pub const SERVICE_ATTACH_REPLY: &str = "cz/attach-reply";
+}

@@ -2,24 +2,27 @@
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
+use crate::code::codes;
 use crate::record;
 
-/// No vehicle: the value of a vehicle field that names nobody.
-pub const NO_VEHICLE: u32 = u32::MAX;
-/// No zone: a vehicle between zones, on a plain link.
-pub const NO_ZONE: u32 = u32::MAX;
+codes! {
+    /// No vehicle: the value of a vehicle field that names nobody.
+    pub const NO_VEHICLE: u32 = u32::MAX;
+    /// No zone: a vehicle between zones, on a plain link.
+    pub const NO_ZONE: u32 = u32::MAX;
 
-/// [`VehicleState::kind`]: a connected automated vehicle, driven by a controller.
-pub const KIND_CAV: u16 = 0;
-/// [`VehicleState::kind`]: a human-driven vehicle (reserved; no v1 world sends one).
-pub const KIND_HUMAN: u16 = 1;
+    /// [`VehicleState::kind`]: a connected automated vehicle, driven by a controller.
+    pub const KIND_CAV: u16 = 0;
+    /// [`VehicleState::kind`]: a human-driven vehicle (reserved; no v1 world sends one).
+    pub const KIND_HUMAN: u16 = 1;
 
-/// [`VehicleState::flags`]: entered the zone during the step just ended (an event of the zone).
-pub const STATE_ENTERED: u16 = 1;
-/// [`VehicleState::flags`]: index 0 of the zone, the vehicle that left it last. Not to be commanded.
-pub const STATE_LEFT: u16 = 2;
-/// [`VehicleState::flags`]: left the zone during the step just ended (an event of the zone).
-pub const STATE_LEFT_NOW: u16 = 4;
+    /// [`VehicleState::flags`]: entered the zone during the step just ended (an event of the zone).
+    pub const STATE_ENTERED: u16 = 1;
+    /// [`VehicleState::flags`]: index 0 of the zone, the vehicle that left it last. Not to be commanded.
+    pub const STATE_LEFT: u16 = 2;
+    /// [`VehicleState::flags`]: left the zone during the step just ended (an event of the zone).
+    pub const STATE_LEFT_NOW: u16 = 4;
+}
 
 record! {
     /// One vehicle as one zone sees it.
