@@ -2,5 +2,9 @@
 //! control zones, as a lockstep multi-process runtime.
 
 pub mod control;
+pub mod coordination;
+pub mod lockstep;
 pub mod scenario;
+pub mod transport;
 pub mod vehicle;
+pub mod world;

@@ -23,7 +23,7 @@ pub use code::{Code, CodeValue};
 pub use command::*;
 pub use coordination::*;
 pub use header::*;
-pub use record::{Field, Layout, Record, Scalar};
+pub use record::{Field, Layout, Record, Scalar, bytes_of};
 pub use services::*;
 pub use state::*;
 pub use summary::*;

@@ -6,6 +6,7 @@
 pub mod demand;
 pub mod network;
 pub mod params;
+pub mod share;
 
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use network::{Approach, Exit, Network, Road, Source, Zone, ZoneId};

@@ -1,0 +1,158 @@
+//! The coordinator of a contiguous range of zones, from state and summary frames to coordination.
+
+use super::flow::FlowController;
+use super::partners;
+use crate::scenario::{Scenario, ZoneId};
+use ipc_schemas::{Assignment, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState, ZoneSummary};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Coordinates some zones; event-driven.
+///
+/// A zone acts in a step in which a vehicle entered or left it, or in which the summary of a neighbour's
+/// event reaches it. It then re-evaluates its terminal speed and sends the full list of assignments.
+/// Summaries reach their receiver one step after the event, also between zones of the same process, so
+/// the result does not depend on how zones are shared out.
+#[derive(Debug)]
+pub struct Coordinator {
+    scenario: Arc<Scenario>,
+    zones: Range<ZoneId>,
+    desks: Vec<Desk>,
+    /// Summaries of this step to zones of this process, delivered in the next one.
+    internal: Vec<ZoneSummary>,
+    internal_step: u64,
+    /// Summaries of this step to zones of other processes.
+    external: Vec<ZoneSummary>,
+    assignments: Vec<Assignment>,
+}
+
+/// What a coordinator keeps for one zone.
+#[derive(Debug)]
+struct Desk {
+    flow: FlowController,
+    /// For each neighbour, the segment of this zone it observes, m.
+    audience: Vec<(ZoneId, f64)>,
+    downstream: Option<ZoneSummary>,
+    told: bool,
+}
+
+impl Coordinator {
+    /// The coordinator of the given zones.
+    pub fn new(scenario: Arc<Scenario>, zones: Range<ZoneId>) -> Coordinator {
+        let network = &scenario.network;
+        let desks = zones
+            .clone()
+            .map(|zone| Desk {
+                flow: FlowController::new(&scenario, zone),
+                audience: network
+                    .neighbours(zone)
+                    .map(|n| {
+                        // Only the upstream neighbour's policy looks into this zone.
+                        let looks = network.downstream(n) == Some(zone);
+                        (n, if looks { FlowController::new(&scenario, n).segment_m() } else { 0.0 })
+                    })
+                    .collect(),
+                downstream: None,
+                told: false,
+            })
+            .collect();
+        Coordinator {
+            zones,
+            desks,
+            internal: Vec::new(),
+            internal_step: 0,
+            external: Vec::new(),
+            assignments: Vec::new(),
+            scenario,
+        }
+    }
+
+    /// Takes the summaries another coordinator sent in the previous step; those to zones of other
+    /// processes are skipped.
+    pub fn receive(&mut self, summaries: &[ZoneSummary]) {
+        for summary in summaries {
+            if self.zones.contains(&summary.to_zone) {
+                let downstream = self.scenario.network.downstream(summary.to_zone);
+                let desk = &mut self.desks[(summary.to_zone - self.zones.start) as usize];
+                desk.told = true;
+                if downstream == Some(summary.from_zone) {
+                    desk.downstream = Some(*summary);
+                }
+            }
+        }
+    }
+
+    /// Acts on a state frame. Afterwards [`assignments`](Self::assignments) and
+    /// [`summaries`](Self::summaries) hold what is to be sent. Returns whether a zone of this process had
+    /// an event of its own, in which case every neighbouring process expects a summary frame.
+    pub fn act(&mut self, step: u64, states: &[VehicleState]) -> bool {
+        let mut had_event = false;
+        if self.internal_step + 1 == step {
+            let internal = std::mem::take(&mut self.internal);
+            self.receive(&internal);
+            self.internal = internal;
+        }
+        self.internal.clear();
+        self.internal_step = step;
+        self.external.clear();
+        self.assignments.clear();
+        for zone in self.zones.clone() {
+            let from = states.partition_point(|s| s.zone < zone);
+            let slice = &states[from..from + states[from..].partition_point(|s| s.zone == zone)];
+            let desk = &mut self.desks[(zone - self.zones.start) as usize];
+            let told = std::mem::take(&mut desk.told);
+            let event = slice.iter().any(|s| s.flags & (STATE_ENTERED | STATE_LEFT_NOW) != 0);
+            had_event |= event;
+            if event {
+                for &(neighbour, segment_m) in &desk.audience {
+                    let summary = summarise(zone, neighbour, segment_m, slice);
+                    if self.zones.contains(&neighbour) {
+                        self.internal.push(summary);
+                    } else {
+                        self.external.push(summary);
+                    }
+                }
+            }
+            if event || told {
+                let terminal = desk.flow.terminal(desk.downstream.as_ref());
+                let zone = &self.scenario.network.zones[zone as usize];
+                partners::assign(zone, slice, terminal, &mut self.assignments);
+            }
+        }
+        had_event
+    }
+
+    /// The assignments of the zones that acted.
+    pub fn assignments(&self) -> &[Assignment] {
+        &self.assignments
+    }
+
+    /// The summaries for zones of the given range (another process's).
+    pub fn summaries(&self, zones: Range<ZoneId>) -> impl Iterator<Item = ZoneSummary> + '_ {
+        self.external.iter().filter(move |s| zones.contains(&s.to_zone)).copied()
+    }
+}
+
+fn summarise(zone: ZoneId, to_zone: ZoneId, segment_m: f64, slice: &[VehicleState]) -> ZoneSummary {
+    let members = slice.iter().filter(|s| s.flags & STATE_LEFT == 0);
+    let (mut vehicles, mut segment_vehicles, mut speed_sum) = (0, 0, 0.0);
+    for state in members {
+        vehicles += 1;
+        if state.x_m <= segment_m {
+            segment_vehicles += 1;
+            speed_sum += state.v_mps;
+        }
+    }
+    ZoneSummary {
+        segment_m,
+        segment_mean_speed_mps: if segment_vehicles > 0 {
+            speed_sum / f64::from(segment_vehicles)
+        } else {
+            0.0
+        },
+        from_zone: zone,
+        to_zone,
+        vehicles,
+        segment_vehicles,
+    }
+}

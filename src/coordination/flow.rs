@@ -1,0 +1,68 @@
+//! Flow control: the terminal speed v_m of a zone from what its downstream neighbour reports
+//! (paper: section "Problem 2", `equ:feedback_control`).
+
+use crate::control::Terminal;
+use crate::control::law::mean_optimal_terminal_speed_mps;
+use crate::scenario::{Baseline, FlowPolicy, Scenario, Segment, ZoneId};
+use ipc_schemas::ZoneSummary;
+
+/// One zone's policy, ready to be evaluated at events.
+#[derive(Clone, Debug)]
+pub struct FlowController {
+    policy: FlowPolicy,
+    /// v_b of a feedback policy, given or computed, m/s.
+    baseline_mps: f64,
+    v_max_mps: f64,
+}
+
+impl FlowController {
+    /// The controller of a zone; a computed baseline is computed here, once.
+    pub fn new(scenario: &Scenario, zone: ZoneId) -> FlowController {
+        let zone = &scenario.network.zones[zone as usize];
+        let baseline_mps = match &zone.flow {
+            FlowPolicy::Feedback { baseline: Baseline::Given(speed), .. } => *speed,
+            FlowPolicy::Feedback { baseline: Baseline::Optimal(entry_speeds), .. } => {
+                let mean_length_m = zone.approaches.iter().map(|a| a.length_m).sum::<f64>()
+                    / zone.approaches.len() as f64;
+                mean_optimal_terminal_speed_mps(scenario, mean_length_m, entry_speeds)
+            }
+            _ => 0.0,
+        };
+        FlowController { policy: zone.flow.clone(), baseline_mps, v_max_mps: scenario.vehicle.v_max_mps }
+    }
+
+    /// Length of the downstream segment the policy observes, m (0 when it observes none).
+    pub fn segment_m(&self) -> f64 {
+        match &self.policy {
+            FlowPolicy::Feedback { segment: Segment::First(l), .. } => *l,
+            FlowPolicy::MeanSpeed { segment_m, .. } => *segment_m,
+            _ => 0.0,
+        }
+    }
+
+    /// The terminal condition, given the last summary of the downstream zone (none before its first
+    /// event, when it is empty).
+    pub fn terminal(&self, downstream: Option<&ZoneSummary>) -> Terminal {
+        match &self.policy {
+            FlowPolicy::None => Terminal::Free,
+            FlowPolicy::Fixed { terminal_mps } => Terminal::Speed(*terminal_mps),
+            FlowPolicy::Feedback { gain_mps, segment, min_mps, .. } => {
+                let count = downstream.map_or(0, |s| match segment {
+                    Segment::Whole => s.vehicles,
+                    Segment::First(_) => s.segment_vehicles,
+                });
+                let speed = self.baseline_mps - gain_mps * f64::from(count);
+                Terminal::Speed(speed.max(*min_mps).min(self.v_max_mps))
+            }
+            FlowPolicy::MeanSpeed { offset_mps, gain_mps, min_mps, .. } => match downstream {
+                Some(s) if s.segment_vehicles > 0 => {
+                    let speed =
+                        s.segment_mean_speed_mps + offset_mps - gain_mps * f64::from(s.segment_vehicles);
+                    Terminal::Speed(speed.max(*min_mps).min(self.v_max_mps))
+                }
+                // Nobody there to measure a speed of, nobody to be careful of.
+                _ => Terminal::Free,
+            },
+        }
+    }
+}

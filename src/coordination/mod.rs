@@ -1,0 +1,8 @@
+//! The coordinator role: passing order, constraint partners and terminal speed of some zones.
+
+mod coordinator;
+mod flow;
+mod partners;
+
+pub use coordinator::Coordinator;
+pub use flow::FlowController;

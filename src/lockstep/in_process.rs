@@ -1,0 +1,134 @@
+//! A whole run in one thread: every driver in turn, over the memory transport.
+
+use super::{
+    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity, LockstepError, Progress,
+    WorldDriver, WorldPorts,
+};
+use crate::control::ControllerPool;
+use crate::coordination::Coordinator;
+use crate::scenario::Scenario;
+use crate::scenario::share::{neighbour_coordinators, zones_of};
+use crate::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
+use crate::world::World;
+use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use std::sync::Arc;
+
+type WorldSide =
+    WorldDriver<MemoryOutbox<VehicleState>, MemoryOutbox<VehicleState>, MemoryInbox<VehicleCommand>>;
+type CoordinatorSide = CoordinatorDriver<
+    MemoryInbox<VehicleState>,
+    MemoryInbox<ZoneSummary>,
+    MemoryOutbox<ZoneSummary>,
+    MemoryOutbox<Assignment>,
+>;
+type ControllerSide =
+    ControllerDriver<MemoryInbox<VehicleState>, MemoryInbox<Assignment>, MemoryOutbox<VehicleCommand>>;
+
+/// World, coordinators and controllers of a run, in one thread.
+#[derive(Debug)]
+pub struct InProcess {
+    world: WorldSide,
+    coordinators: Vec<CoordinatorSide>,
+    controllers: Vec<ControllerSide>,
+}
+
+impl InProcess {
+    /// A run of the scenario with that many coordinator and controller roles.
+    pub fn new(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32) -> InProcess {
+        let zones = scenario.network.zones.len() as u32;
+        let run_id = 1;
+        let mut state = MemoryService::new(frames::SERVICE_STATE);
+        let mut coordinator_state = MemoryService::new(frames::SERVICE_COORDINATOR_STATE);
+        let mut coordination = MemoryService::new(frames::SERVICE_COORDINATION);
+        let mut command = MemoryService::new(frames::SERVICE_COMMAND);
+        let mut summaries: Vec<MemoryService<ZoneSummary>> =
+            (0..coordinators).map(|_| MemoryService::new(frames::SERVICE_SUMMARY_PREFIX)).collect();
+        // All inboxes before any outbox.
+        let controller_inboxes: Vec<_> =
+            (0..controllers).map(|_| (state.inbox(), coordination.inbox())).collect();
+        let coordinator_inboxes: Vec<_> =
+            summaries.iter_mut().map(|s| (coordinator_state.inbox(), s.inbox())).collect();
+        let command_inbox = command.inbox();
+        let masks = neighbour_coordinators(&scenario.network, coordinators);
+        let identity = |role, index| Identity { run_id, role, index: index as u16, generation: 0 };
+        let coordinators_side = coordinator_inboxes
+            .into_iter()
+            .zip(0..)
+            .map(|((state, inbox), index)| {
+                let neighbours = (0..coordinators)
+                    .filter(|n| masks[index as usize] >> n & 1 == 1)
+                    .map(|n| (n as u16, zones_of(zones, n, coordinators), summaries[n as usize].outbox()))
+                    .collect();
+                let ports = CoordinatorPorts {
+                    state,
+                    summaries: inbox,
+                    neighbours,
+                    coordination: coordination.outbox(),
+                };
+                let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
+                CoordinatorDriver::new(role, ports, identity(Role::Coordinator, index), controllers)
+            })
+            .collect();
+        let controllers_side = controller_inboxes
+            .into_iter()
+            .zip(0..)
+            .map(|((state, coordination), index)| {
+                let ports = ControllerPorts { state, coordination, command: command.outbox() };
+                let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, controllers));
+                ControllerDriver::new(role, ports, identity(Role::Controller, index), 0)
+            })
+            .collect();
+        let ports = WorldPorts {
+            state: state.outbox(),
+            coordinator_state: coordinator_state.outbox(),
+            command: command_inbox,
+        };
+        let world = World::new(scenario.clone(), coordinators);
+        InProcess {
+            world: WorldDriver::new(world, ports, run_id, controllers, coordinators),
+            coordinators: coordinators_side,
+            controllers: controllers_side,
+        }
+    }
+
+    /// The world as it stands.
+    pub fn world(&self) -> &World {
+        self.world.world()
+    }
+
+    /// Runs one step; `false` once the run is over.
+    ///
+    /// # Panics
+    /// When all roles wait for each other, which the protocol rules out.
+    pub fn step(&mut self) -> Result<bool, LockstepError> {
+        let step = self.world().step();
+        loop {
+            let mut progress = false;
+            match self.world.advance()? {
+                Progress::Finished => return Ok(false),
+                Progress::Advanced => progress = true,
+                Progress::Waiting(_) => {}
+            }
+            if self.world().step() != step {
+                return Ok(true);
+            }
+            for coordinator in &mut self.coordinators {
+                while coordinator.advance()? == Progress::Advanced {
+                    progress = true;
+                }
+            }
+            for controller in &mut self.controllers {
+                while controller.advance()? == Progress::Advanced {
+                    progress = true;
+                }
+            }
+            assert!(progress, "lockstep: every role waits for another in step {step}");
+        }
+    }
+
+    /// Runs to the end.
+    pub fn run(&mut self) -> Result<(), LockstepError> {
+        while self.step()? {}
+        Ok(())
+    }
+}

@@ -1,0 +1,164 @@
+//! The step protocol over any transport.
+//!
+//! Each role has a driver: a state machine around the pure role that takes what has arrived, sends what
+//! is due, and says whom it waits for. Drivers never block; how to wait is the caller's business
+//! ([`wait`] between processes, a simple round in [`in_process`]).
+
+mod controller;
+mod coordinator;
+pub mod in_process;
+pub mod wait;
+mod world;
+
+pub use controller::{ControllerDriver, ControllerPorts};
+pub use coordinator::{CoordinatorDriver, CoordinatorPorts};
+pub use world::{WorldDriver, WorldPorts};
+
+use crate::control::pool::PoolError;
+use crate::transport::TransportError;
+use crate::world::CommandFault;
+use ipc_schemas::{FrameHeader, HeaderFault, Role};
+
+/// What a driver did.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Progress {
+    /// Something; ask again at once.
+    Advanced,
+    /// Nothing: a frame is missing.
+    Waiting(Awaited),
+    /// The run is over.
+    Finished,
+}
+
+/// The frame a driver waits for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Awaited {
+    /// Role of the sender.
+    pub role: Role,
+    /// Bit per process of that role still missing.
+    pub missing: u64,
+    /// What it is to send.
+    pub what: &'static str,
+    /// Step the frame belongs to.
+    pub step: u64,
+}
+
+impl std::fmt::Display for Awaited {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{} of step {} from ", self.what, self.step)?;
+        if self.role == Role::World {
+            return f.write_str("the world");
+        }
+        let mut separator = "";
+        for index in (0..64).filter(|i| self.missing >> i & 1 == 1) {
+            write!(f, "{separator}{} {index}", self.role)?;
+            separator = ", ";
+        }
+        Ok(())
+    }
+}
+
+/// Who a driver is, for the headers it writes and checks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Identity {
+    /// Run id.
+    pub run_id: u64,
+    /// Own role.
+    pub role: Role,
+    /// Own index among the processes of the role.
+    pub index: u16,
+    /// Own generation.
+    pub generation: u32,
+}
+
+impl Identity {
+    /// A header from this sender for a step.
+    pub fn header(&self, step: u64, time_ns: u64) -> FrameHeader {
+        FrameHeader {
+            run_id: self.run_id,
+            schema_hash: ipc_schemas::schema_hash(),
+            step,
+            time_ns,
+            sender_role: self.role as u16,
+            sender_index: self.index,
+            generation: self.generation,
+            ..FrameHeader::default()
+        }
+    }
+}
+
+/// Why a driver cannot go on.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum LockstepError {
+    /// The transport failed.
+    #[error(transparent)]
+    Transport(#[from] TransportError),
+    /// A frame's header is not what the protocol asks for.
+    #[error("frame from {sender}: {fault}")]
+    Header {
+        /// Who sent it.
+        sender: String,
+        /// What is wrong.
+        fault: HeaderFault,
+    },
+    /// Two frames of the same step from the same sender, or one nobody asked for.
+    #[error("{sender} sent an unexpected frame for step {step}")]
+    Unexpected {
+        /// Who sent it.
+        sender: String,
+        /// Step in its header.
+        step: u64,
+    },
+    /// A frame reached fewer receivers than the run has.
+    #[error("step {step}: {what} reached {reached} of {expected} receivers")]
+    LostReceiver {
+        /// What was sent.
+        what: &'static str,
+        /// Step.
+        step: u64,
+        /// Receivers reached.
+        reached: usize,
+        /// Receivers expected.
+        expected: usize,
+    },
+    /// A controller's commands do not fit the state.
+    #[error("step {step}, {sender}: {fault}")]
+    Command {
+        /// Step.
+        step: u64,
+        /// Who sent them.
+        sender: String,
+        /// What is wrong.
+        fault: CommandFault,
+    },
+    /// All controllers answered but some vehicles have no command.
+    #[error("step {step}: {vehicles} vehicles were commanded by nobody")]
+    Uncommanded {
+        /// Step.
+        step: u64,
+        /// Their number.
+        vehicles: usize,
+    },
+    /// State and coordination frames contradict each other.
+    #[error("step {step}: {fault}")]
+    Pool {
+        /// Step.
+        step: u64,
+        /// What is wrong.
+        fault: PoolError,
+    },
+}
+
+/// The sender a header names, for messages.
+fn sender(header: &FrameHeader) -> String {
+    match Role::from_code(header.sender_role) {
+        Some(Role::World) => "the world".to_owned(),
+        Some(role) => format!("{role} {}", header.sender_index),
+        None => format!("a sender of unknown role {}", header.sender_role),
+    }
+}
+
+/// A mask with one bit for each of `count` processes.
+fn mask_of(count: u32) -> u64 {
+    if count >= 64 { u64::MAX } else { (1 << count) - 1 }
+}

@@ -1,0 +1,100 @@
+//! How frames travel: one interface, two transports.
+//!
+//! An [`Outbox`] lends memory in which a frame is written where its receivers will read it; an
+//! [`Inbox`] hands out frames where they lie. Nothing is copied on either side. Neither blocks.
+
+pub mod iox;
+pub mod memory;
+
+use ipc_schemas::{FrameHeader, Record};
+use std::mem::MaybeUninit;
+
+/// The sending end of a service.
+pub trait Outbox<R: Record> {
+    /// A frame being written.
+    type Loan<'a>: Loan<R>
+    where
+        Self: 'a;
+
+    /// Lends memory for a frame of `count` records, all of which `fill` must write. `record_count` of
+    /// the header is set here.
+    ///
+    /// # Panics
+    /// When `fill` writes another number of records.
+    fn loan(
+        &mut self,
+        header: FrameHeader,
+        count: usize,
+        fill: impl FnOnce(&mut Slots<'_, R>),
+    ) -> Result<Self::Loan<'_>, TransportError>;
+}
+
+/// A frame that has been written and not yet sent; dropped, it is never seen.
+pub trait Loan<R: Record> {
+    /// The records.
+    fn records(&self) -> &[R];
+    /// Sends the frame to every receiver and returns their number.
+    fn send(self) -> Result<usize, TransportError>;
+}
+
+/// The receiving end of a service.
+pub trait Inbox<R: Record> {
+    /// A received frame.
+    type Frame: Frame<R>;
+
+    /// The next frame, if there is one.
+    fn receive(&mut self) -> Result<Option<Self::Frame>, TransportError>;
+}
+
+/// A received frame, borrowed from the transport until dropped.
+pub trait Frame<R: Record> {
+    /// The header, not yet checked.
+    fn header(&self) -> &FrameHeader;
+    /// The records.
+    fn records(&self) -> &[R];
+}
+
+/// Memory for the records of a frame, filled front to back.
+#[derive(Debug)]
+pub struct Slots<'a, R> {
+    slots: &'a mut [MaybeUninit<R>],
+    filled: usize,
+}
+
+impl<'a, R: Record> Slots<'a, R> {
+    fn new(slots: &'a mut [MaybeUninit<R>]) -> Slots<'a, R> {
+        Slots { slots, filled: 0 }
+    }
+
+    /// Writes the next record.
+    ///
+    /// # Panics
+    /// When all records have been written already.
+    pub fn push(&mut self, record: R) {
+        self.slots[self.filled].write(record);
+        self.filled += 1;
+    }
+
+    fn assert_full(&self) {
+        assert_eq!(self.filled, self.slots.len(), "a frame is filled with as many records as were asked for");
+    }
+}
+
+/// Why a frame could not be sent or received.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TransportError {
+    /// A receiver has not taken the frames sent to it before.
+    #[error("{service}: a receiver has not taken the frames sent before")]
+    ReceiverFull {
+        /// Service name.
+        service: String,
+    },
+    /// The transport failed.
+    #[error("{service}: {reason}")]
+    Failed {
+        /// Service name.
+        service: String,
+        /// What the transport said.
+        reason: String,
+    },
+}

@@ -1,0 +1,83 @@
+//! Entry roads: who arrives when, and who has to wait outside.
+
+use crate::scenario::arrivals::ArrivalStream;
+use crate::scenario::{Arrival, Scenario};
+use crate::vehicle::Held;
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, VecDeque};
+
+/// All entry roads.
+#[derive(Debug)]
+pub(super) struct Gates {
+    streams: Vec<ArrivalStream>,
+    pending: Vec<Option<Arrival>>,
+    /// Roads by their next arrival: instant (as ordered bits), then road order.
+    next: BinaryHeap<Reverse<(u64, usize)>>,
+    pub waiting: Vec<VecDeque<Waiting>>,
+    left_to_generate: u32,
+    pub held: u32,
+}
+
+/// An arrival that has not entered yet.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Waiting {
+    pub arrival: Arrival,
+    /// It could not enter when it came.
+    pub held: bool,
+}
+
+impl Gates {
+    pub(super) fn new(scenario: &Scenario) -> Gates {
+        let roads = &scenario.network.roads;
+        let mut gates = Gates {
+            streams: roads.iter().zip(0..).map(|(road, i)| ArrivalStream::new(road, i, scenario.seed)).collect(),
+            pending: vec![None; roads.len()],
+            next: BinaryHeap::with_capacity(roads.len()),
+            waiting: vec![VecDeque::new(); roads.len()],
+            left_to_generate: scenario.max_vehicles.unwrap_or(u32::MAX),
+            held: 0,
+        };
+        for road in 0..roads.len() {
+            gates.draw(road);
+        }
+        gates
+    }
+
+    fn draw(&mut self, road: usize) {
+        self.pending[road] = self.streams[road].next();
+        if let Some(arrival) = self.pending[road] {
+            // Instants are >= 0, so their bits are in the order of their values.
+            self.next.push(Reverse((arrival.time_s.to_bits(), road)));
+        }
+    }
+
+    /// Moves all arrivals up to `until_s` to their road's queue, in order of instant, then road.
+    pub(super) fn advance(&mut self, until_s: f64) {
+        while self.left_to_generate > 0 {
+            let Some(&Reverse((bits, road))) = self.next.peek() else { return };
+            if f64::from_bits(bits) > until_s {
+                return;
+            }
+            self.next.pop();
+            let arrival = self.pending[road].take().expect("a queued road has a pending arrival");
+            self.waiting[road].push_back(Waiting { arrival, held: false });
+            self.left_to_generate -= 1;
+            self.draw(road);
+        }
+    }
+
+    /// Whether nobody will come any more and nobody waits.
+    pub(super) fn exhausted(&self) -> bool {
+        (self.left_to_generate == 0 || self.next.is_empty()) && self.waiting.iter().all(VecDeque::is_empty)
+    }
+}
+
+/// Whether a vehicle may enter at speed `v_mps` behind `leader`, `after_s` into the step, without an
+/// overlap that full braking could not prevent: should the leader brake to a stop, the newcomer, braking
+/// as hard one step later, must stop `gap_m` behind it.
+pub(super) fn may_enter(leader: &Held, after_s: f64, v_mps: f64, gap_m: f64, u_min_mps2: f64, dt_s: f64) -> bool {
+    let distance = leader.position_m(after_s);
+    let lead_v = leader.speed_mps(after_s);
+    let stopping = (v_mps * v_mps - lead_v * lead_v) / (2.0 * -u_min_mps2);
+    distance >= gap_m && distance >= gap_m + stopping + v_mps * dt_s
+}

@@ -1,0 +1,144 @@
+//! What a run is judged by, per zone and in all.
+
+use super::car::Visit;
+use serde::{Deserialize, Serialize};
+
+/// Running sums of one zone.
+#[derive(Clone, Debug)]
+pub(super) struct ZoneMetrics {
+    pub vehicles: u32,
+    pub time_s: f64,
+    pub energy: f64,
+    pub fe_vehicles: u32,
+    pub fe_s: f64,
+    pub infeasible_vehicles: u32,
+    pub least_rear_end_m: f64,
+    pub least_rear_end_clean_m: f64,
+    pub least_merge_m: f64,
+    pub least_merge_clean_m: f64,
+    pub order_violations: u32,
+    pub overtakes: u32,
+}
+
+impl Default for ZoneMetrics {
+    fn default() -> ZoneMetrics {
+        ZoneMetrics {
+            vehicles: 0,
+            time_s: 0.0,
+            energy: 0.0,
+            fe_vehicles: 0,
+            fe_s: 0.0,
+            infeasible_vehicles: 0,
+            least_rear_end_m: f64::INFINITY,
+            least_rear_end_clean_m: f64::INFINITY,
+            least_merge_m: f64::INFINITY,
+            least_merge_clean_m: f64::INFINITY,
+            order_violations: 0,
+            overtakes: 0,
+        }
+    }
+}
+
+impl ZoneMetrics {
+    /// Accounts a vehicle that has passed the conflict point.
+    pub(super) fn leave(&mut self, visit: &Visit, time_s: f64, merge_margin_m: Option<f64>) {
+        self.vehicles += 1;
+        self.time_s += time_s;
+        self.energy += visit.energy;
+        if visit.fe_s > 0.0 {
+            self.fe_vehicles += 1;
+            self.fe_s += visit.fe_s;
+        }
+        self.infeasible_vehicles += u32::from(visit.infeasible);
+        self.observe(visit);
+        if let Some(margin) = merge_margin_m {
+            self.least_merge_m = self.least_merge_m.min(margin);
+            if visit.clean_merge {
+                self.least_merge_clean_m = self.least_merge_clean_m.min(margin);
+            }
+        }
+    }
+
+    /// Accounts the rear-end margin of a vehicle that leaves, or is still inside when the run ends.
+    pub(super) fn observe(&mut self, visit: &Visit) {
+        self.least_rear_end_m = self.least_rear_end_m.min(visit.least_rear_end_m);
+        if visit.clean_rear_end {
+            self.least_rear_end_clean_m = self.least_rear_end_clean_m.min(visit.least_rear_end_m);
+        }
+    }
+
+    pub(super) fn row(&self, zone: &str, beta: f64) -> ZoneSummaryRow {
+        let mean = |sum: f64, count: u32| if count == 0 { 0.0 } else { sum / f64::from(count) };
+        let seen = |margin: f64| margin.is_finite().then_some(margin);
+        let mean_time_s = mean(self.time_s, self.vehicles);
+        let mean_energy = mean(self.energy, self.vehicles);
+        ZoneSummaryRow {
+            zone: zone.to_owned(),
+            vehicles: self.vehicles,
+            mean_time_s,
+            mean_energy,
+            mean_objective: beta * mean_time_s + mean_energy,
+            fe_vehicles: self.fe_vehicles,
+            fe_mean_s: mean(self.fe_s, self.fe_vehicles),
+            infeasible_vehicles: self.infeasible_vehicles,
+            min_rear_end_margin_m: seen(self.least_rear_end_m),
+            min_merge_margin_m: seen(self.least_merge_m),
+            min_rear_end_margin_clean_m: seen(self.least_rear_end_clean_m),
+            min_merge_margin_clean_m: seen(self.least_merge_clean_m),
+            order_violations: self.order_violations,
+            overtakes: self.overtakes,
+        }
+    }
+}
+
+/// One zone's results.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ZoneSummaryRow {
+    /// Zone name.
+    pub zone: String,
+    /// Vehicles that passed the conflict point.
+    pub vehicles: u32,
+    /// Mean travel time, s.
+    pub mean_time_s: f64,
+    /// Mean energy, the integral of u^2/2, m^2/s^3.
+    pub mean_energy: f64,
+    /// Mean objective, beta * time + energy (paper: `eqn:energyobj`).
+    pub mean_objective: f64,
+    /// Vehicles that braked in FE mode.
+    pub fe_vehicles: u32,
+    /// Mean time in FE mode of those vehicles, s.
+    pub fe_mean_s: f64,
+    /// Vehicles that met an infeasible QP.
+    pub infeasible_vehicles: u32,
+    /// Least rear-end margin of any vehicle at any instant, m; absent when no vehicle had a leader.
+    pub min_rear_end_margin_m: Option<f64>,
+    /// Least merging margin of any vehicle at its crossing, m; absent when none was needed.
+    pub min_merge_margin_m: Option<f64>,
+    /// The same for vehicles whose rear-end entry conditions held when they entered.
+    pub min_rear_end_margin_clean_m: Option<f64>,
+    /// The same for vehicles whose merging entry conditions held when they entered.
+    pub min_merge_margin_clean_m: Option<f64>,
+    /// Vehicles that passed the conflict point before one that entered earlier.
+    pub order_violations: u32,
+    /// Samples at which a vehicle was ahead of its leader.
+    pub overtakes: u32,
+}
+
+/// Results of a run as far as the world knows them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct WorldSummary {
+    /// Steps integrated.
+    pub steps: u64,
+    /// Chained hash of all state frames.
+    pub state_hash: u64,
+    /// Vehicles that entered the network.
+    pub arrived: u32,
+    /// Vehicles that left it.
+    pub departed: u32,
+    /// Arrivals that had to wait outside because they would have overlapped another vehicle.
+    pub held_arrivals: u32,
+    /// Vehicles still waiting outside when the run ended.
+    pub waiting: u32,
+    /// Per zone.
+    pub zones: Vec<ZoneSummaryRow>,
+}

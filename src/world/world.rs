@@ -1,0 +1,313 @@
+//! The world as a state machine: state frame out, command frames in, one step on.
+
+use super::car::{Car, LeftCar};
+use super::gate::Gates;
+use super::link::Link;
+use super::metrics::{WorldSummary, ZoneMetrics};
+use crate::scenario::share::{neighbour_coordinators, zones_of};
+use crate::scenario::{Exit, Scenario};
+use ipc_schemas::{self as frames, VehicleCommand, VehicleState};
+use std::sync::Arc;
+use xxhash_rust::xxh3::xxh3_64_with_seed;
+
+/// The world.
+#[derive(Debug)]
+pub struct World {
+    pub(super) scenario: Arc<Scenario>,
+    pub(super) step: u64,
+    pub(super) zones: Vec<Traffic>,
+    /// The link behind each zone's exit; never used when the length is 0.
+    pub(super) links: Vec<Link>,
+    pub(super) gates: Gates,
+    /// Acceleration every vehicle so far holds over the step being integrated, by vehicle id; 0 once it
+    /// has left the network. Lets a zone's index 0 move with the vehicle it stands for.
+    pub(super) held_u_mps2: Vec<f64>,
+    pub(super) departed: u32,
+    pub(super) metrics: Vec<ZoneMetrics>,
+    pub(super) entries: Vec<super::integrate::Entry>,
+    state_hash: u64,
+    /// Zones of each coordinator process, their neighbour processes, and who had an event.
+    coordinators: Vec<CoordinatorShare>,
+    summarised: u64,
+    commanded: u32,
+}
+
+/// The vehicles of one zone.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Traffic {
+    /// Index 0 of the paper's S(t).
+    pub left: Option<LeftCar>,
+    /// Members in order of entry.
+    pub cars: Vec<Car>,
+}
+
+impl Traffic {
+    /// Whether a vehicle entered or left in the step just ended.
+    fn has_event(&self) -> bool {
+        self.left.is_some_and(|l| l.left_now) || self.cars.iter().rev().any(|c| c.entered)
+    }
+}
+
+#[derive(Debug)]
+struct CoordinatorShare {
+    zones: std::ops::Range<u32>,
+    neighbours: u64,
+}
+
+/// A command the world cannot take.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum CommandFault {
+    /// The command names a vehicle that is not the next one of that zone.
+    #[error("command for vehicle {vehicle} in zone {zone}, where vehicle {expected} was expected")]
+    OtherVehicle {
+        /// Vehicle named.
+        vehicle: u32,
+        /// Zone named.
+        zone: u32,
+        /// Vehicle expected at that place, or `NO_VEHICLE`.
+        expected: u32,
+    },
+    /// The zone has another number of vehicles.
+    #[error("{commands} commands for zone {zone}, which has {vehicles} vehicles")]
+    OtherCount {
+        /// Zone named.
+        zone: u32,
+        /// Commands received.
+        commands: usize,
+        /// Vehicles present.
+        vehicles: usize,
+    },
+    /// The acceleration is not a number within the vehicle's limits.
+    #[error("vehicle {vehicle}: acceleration {u_mps2} m/s^2 is not within [{min_mps2}, {max_mps2}]")]
+    OutOfLimits {
+        /// Vehicle named.
+        vehicle: u32,
+        /// Acceleration commanded.
+        u_mps2: f64,
+        /// Least allowed.
+        min_mps2: f64,
+        /// Greatest allowed.
+        max_mps2: f64,
+    },
+}
+
+impl World {
+    /// A world at step 0, before the first arrival, for a run with that many coordinator processes.
+    pub fn new(scenario: Arc<Scenario>, coordinators: u32) -> World {
+        let network = &scenario.network;
+        let zones = network.zones.len();
+        let shares = neighbour_coordinators(network, coordinators)
+            .into_iter()
+            .enumerate()
+            .map(|(i, neighbours)| CoordinatorShare {
+                zones: zones_of(zones as u32, i as u32, coordinators),
+                neighbours,
+            })
+            .collect();
+        let links = network
+            .zones
+            .iter()
+            .map(|z| match z.exit {
+                Exit::Zone { link_m, .. } => Link { length_m: link_m, cars: Vec::new() },
+                Exit::Out => Link::default(),
+            })
+            .collect();
+        World {
+            step: 0,
+            zones: vec![Traffic::default(); zones],
+            links,
+            gates: Gates::new(&scenario),
+            held_u_mps2: Vec::new(),
+            departed: 0,
+            metrics: vec![ZoneMetrics::default(); zones],
+            entries: Vec::new(),
+            state_hash: 0,
+            coordinators: shares,
+            summarised: 0,
+            commanded: 0,
+            scenario,
+        }
+    }
+
+    /// The present step.
+    pub fn step(&self) -> u64 {
+        self.step
+    }
+
+    /// Simulated time of the present step, ns.
+    pub fn time_ns(&self) -> u64 {
+        self.step * self.scenario.dt_ns
+    }
+
+    /// Whether the run is over: all demand served, or out of time.
+    pub fn is_finished(&self) -> bool {
+        self.scenario.time_s(self.step) >= self.scenario.max_time_s
+            || (self.gates.exhausted()
+                && self.zones.iter().all(|z| z.cars.is_empty())
+                && self.links.iter().all(|l| l.cars.is_empty()))
+    }
+
+    /// Vehicles that have entered the network so far.
+    pub fn arrived(&self) -> u32 {
+        self.held_u_mps2.len() as u32
+    }
+
+    /// The number of records of the present state frame.
+    pub fn record_count(&self) -> usize {
+        let in_zones: usize = self.zones.iter().map(|z| z.cars.len() + usize::from(z.left.is_some())).sum();
+        in_zones + self.links.iter().map(|l| l.cars.len()).sum::<usize>()
+    }
+
+    /// The records of the present state frame (see [`VehicleState`] for their order).
+    pub fn records(&self) -> impl Iterator<Item = VehicleState> + '_ {
+        let length_m = self.scenario.vehicle.length_m;
+        let record = move |car: &Car, zone: u32, flags: u16| VehicleState {
+            x_m: car.x_m,
+            v_mps: car.v_mps,
+            u_mps2: car.u_mps2,
+            entry_time_s: car.entry_time_s,
+            entry_speed_mps: car.entry_speed_mps,
+            planned_exit_time_s: car.planned_exit_time_s,
+            planned_exit_speed_mps: car.planned_exit_speed_mps,
+            length_m,
+            vehicle: car.vehicle,
+            zone,
+            path: car.path,
+            kind: frames::KIND_CAV,
+            flags,
+        };
+        let in_zones = self.zones.iter().enumerate().flat_map(move |(zone, traffic)| {
+            let left = traffic.left.iter().map(move |l| {
+                let now = if l.left_now { frames::STATE_LEFT_NOW } else { 0 };
+                record(&l.car, zone as u32, frames::STATE_LEFT | now)
+            });
+            let members = traffic.cars.iter().map(move |c| {
+                record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 })
+            });
+            left.chain(members)
+        });
+        let on_links = self
+            .links
+            .iter()
+            .flat_map(move |link| link.cars.iter().map(move |c| record(c, frames::NO_ZONE, 0)));
+        in_zones.chain(on_links)
+    }
+
+    /// Chains a published state frame into the state hash.
+    pub fn seal(&mut self, records: &[VehicleState]) {
+        self.state_hash = xxh3_64_with_seed(frames::bytes_of(records), self.state_hash);
+    }
+
+    /// The state hash so far: XXH3 over each state frame, seeded with the hash before it.
+    pub fn state_hash(&self) -> u64 {
+        self.state_hash
+    }
+
+    /// Which coordinator processes act in the present step, and which sent summaries in the last one.
+    ///
+    /// A process acts when one of its zones has an event, when one had an event in the previous step
+    /// (its other zones hear of it now), or when a neighbouring process had one then.
+    pub fn coordinator_masks(&mut self) -> CoordinatorMasks {
+        let mut events = 0u64;
+        for (i, share) in self.coordinators.iter().enumerate() {
+            let own = &self.zones[share.zones.start as usize..share.zones.end as usize];
+            if own.iter().any(Traffic::has_event) {
+                events |= 1 << i;
+            }
+        }
+        let summarised = std::mem::replace(&mut self.summarised, events);
+        let mut acting = events | summarised;
+        for (i, share) in self.coordinators.iter().enumerate() {
+            if share.neighbours & summarised != 0 {
+                acting |= 1 << i;
+            }
+        }
+        CoordinatorMasks { acting, summarised }
+    }
+
+    /// Takes one controller's commands for the present step.
+    pub fn command(&mut self, commands: &[VehicleCommand]) -> Result<(), CommandFault> {
+        let limits = self.scenario.vehicle;
+        let dt_s = self.scenario.dt_s();
+        for group in commands.chunk_by(|a, b| a.zone == b.zone) {
+            let zone = group[0].zone;
+            let Some(traffic) = self.zones.get_mut(zone as usize) else {
+                let expected = frames::NO_VEHICLE;
+                return Err(CommandFault::OtherVehicle { vehicle: group[0].vehicle, zone, expected });
+            };
+            if traffic.cars.len() != group.len() {
+                let (commands, vehicles) = (group.len(), traffic.cars.len());
+                return Err(CommandFault::OtherCount { zone, commands, vehicles });
+            }
+            for (car, command) in traffic.cars.iter_mut().zip(group) {
+                if car.vehicle != command.vehicle {
+                    let expected = car.vehicle;
+                    return Err(CommandFault::OtherVehicle { vehicle: command.vehicle, zone, expected });
+                }
+                let u = command.u_mps2;
+                // Written so that NaN is refused too.
+                if !(u >= limits.u_min_mps2 && u <= limits.u_max_mps2) {
+                    return Err(CommandFault::OutOfLimits {
+                        vehicle: command.vehicle,
+                        u_mps2: u,
+                        min_mps2: limits.u_min_mps2,
+                        max_mps2: limits.u_max_mps2,
+                    });
+                }
+                car.command_mps2 = u;
+                car.planned_exit_time_s = command.planned_exit_time_s;
+                car.planned_exit_speed_mps = command.planned_exit_speed_mps;
+                if command.verdict == frames::VERDICT_FE {
+                    car.visit.fe_s += dt_s;
+                }
+                car.visit.infeasible |= command.verdict == frames::VERDICT_INFEASIBLE;
+            }
+            self.commanded += group.len() as u32;
+        }
+        Ok(())
+    }
+
+    /// Integrates one step with the commands taken.
+    ///
+    /// # Errors
+    /// The number of vehicles without a command, when there are any.
+    pub fn advance(&mut self) -> Result<(), usize> {
+        let vehicles: usize = self.zones.iter().map(|z| z.cars.len()).sum();
+        let commanded = std::mem::take(&mut self.commanded) as usize;
+        if commanded != vehicles {
+            return Err(vehicles.abs_diff(commanded));
+        }
+        self.integrate();
+        self.step += 1;
+        Ok(())
+    }
+
+    /// The results so far.
+    pub fn summary(&self) -> WorldSummary {
+        let zones = self.scenario.network.zones.iter().zip(&self.metrics).zip(&self.zones);
+        WorldSummary {
+            steps: self.step,
+            state_hash: self.state_hash,
+            arrived: self.arrived(),
+            departed: self.departed,
+            held_arrivals: self.gates.held,
+            waiting: self.gates.waiting.iter().map(|w| w.len() as u32).sum(),
+            zones: zones
+                .map(|((zone, metrics), traffic)| {
+                    let mut metrics = metrics.clone();
+                    traffic.cars.iter().for_each(|car| metrics.observe(&car.visit));
+                    metrics.row(&zone.name, self.scenario.beta)
+                })
+                .collect(),
+        }
+    }
+}
+
+/// Bit `i` stands for coordinator process `i`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CoordinatorMasks {
+    /// Processes that act in the present step.
+    pub acting: u64,
+    /// Processes that had an event, and sent summaries, in the previous step.
+    pub summarised: u64,
+}
