@@ -3,12 +3,19 @@
 //! A [`Scenario`] is validated: every value in it is finite and within its stated range, every index
 //! points at something, and the network is acyclic. Nothing downstream checks these again.
 
+pub mod arrivals;
 pub mod demand;
+mod embedded;
+pub mod encode;
+pub mod load;
 pub mod network;
 pub mod params;
 pub mod share;
 
+pub use arrivals::ArrivalStream;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
+pub use encode::{DecodeError, decode, encode, scenario_hash};
+pub use load::{DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file};
 pub use network::{Approach, Exit, Network, Road, Source, Zone, ZoneId};
 pub use params::{
     Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,

@@ -1,0 +1,178 @@
+//! Scenario text in, validated [`Scenario`] out.
+//!
+//! The text is parsed into a tree of values with their origins (`document`), `--set`s are written over it
+//! (`overrides`), and one pass reads and checks it (`sections`, `topology`, `demand`), so that each failure
+//! is one message naming place, key, value and what was expected.
+
+mod demand;
+mod document;
+mod error;
+mod overrides;
+mod sections;
+mod table;
+mod topology;
+
+pub use error::{Place, ScenarioError};
+pub use overrides::Override;
+
+use super::{Network, Road, Scenario, embedded};
+use demand::{DemandReader, MAX_TIME_S, TraceBase};
+use document::{Document, Node, Origin, Value};
+use std::collections::BTreeMap;
+use std::path::Path;
+use table::Table;
+
+/// The scenario that runs when none is named.
+pub const DEFAULT_SCENARIO: &str = "two-merges";
+
+/// Names of the embedded scenarios, the default first.
+pub fn embedded_names() -> impl Iterator<Item = &'static str> {
+    embedded::SCENARIOS.iter().map(|(name, _)| *name)
+}
+
+/// Text of an embedded scenario.
+pub fn embedded_text(name: &str) -> Option<&'static str> {
+    embedded::SCENARIOS.iter().find(|(n, _)| *n == name).map(|(_, text)| *text)
+}
+
+/// Loads the scenario a command line names: nothing for the default, a file, or an embedded name.
+///
+/// A name with a `/` or ending in `.toml` is a file, and so is one that exists as a file.
+pub fn load(
+    argument: Option<&str>,
+    overrides: &[Override],
+    seed: Option<u64>,
+) -> Result<Scenario, ScenarioError> {
+    let name = argument.unwrap_or(DEFAULT_SCENARIO);
+    let path = Path::new(name);
+    // The default must not depend on what the current directory happens to hold.
+    if argument.is_some() && (name.contains('/') || name.ends_with(".toml") || path.is_file()) {
+        load_file(path, overrides, seed)
+    } else {
+        load_embedded(name, overrides, seed)
+    }
+}
+
+/// Loads a scenario file. Traces are relative to its directory. `seed` goes before the file's.
+pub fn load_file(path: &Path, overrides: &[Override], seed: Option<u64>) -> Result<Scenario, ScenarioError> {
+    let text = std::fs::read_to_string(path)
+        .map_err(|source| ScenarioError::Read { path: path.to_owned(), source })?;
+    let base = TraceBase::Directory(path.parent().unwrap_or(Path::new("")).to_owned());
+    load_text(&path.display().to_string(), &text, base, overrides, seed)
+}
+
+/// Loads an embedded scenario. Traces are embedded ones, or relative to the current directory.
+pub fn load_embedded(
+    name: &str,
+    overrides: &[Override],
+    seed: Option<u64>,
+) -> Result<Scenario, ScenarioError> {
+    let Some(text) = embedded_text(name) else {
+        return Err(ScenarioError::UnknownScenario {
+            name: name.to_owned(),
+            known: embedded_names().collect::<Vec<_>>().join(", "),
+            suggestion: error::nearest(name, embedded_names()),
+        });
+    };
+    load_text(&format!("<embedded>/{name}.toml"), text, TraceBase::Embedded, overrides, seed)
+}
+
+fn load_text(
+    file: &str,
+    text: &str,
+    base: TraceBase,
+    overrides: &[Override],
+    seed: Option<u64>,
+) -> Result<Scenario, ScenarioError> {
+    let mut document = Document::parse(file, text)?;
+    for set in overrides {
+        set.apply(&mut document)?;
+    }
+    if let (Some(seed), Value::Table(root)) = (seed, &mut document.root.value) {
+        let node = Node { origin: Origin::Seed(seed), value: Value::Integer(seed.into()) };
+        root.insert("seed".to_owned(), node);
+    }
+    read(&document, base)
+}
+
+fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError> {
+    let root = Table::root(document);
+    root.only(&["name", "seed", "dt_s", "end", "vehicle", "objective", "control", "roads", "zones"])?;
+    let name = root.name()?.to_owned();
+    let seed = match root.get("seed") {
+        Some(field) => field.integer(0, "an integer from 0 to 2^64 - 1")?,
+        None => 1,
+    };
+    let dt_ns = dt_ns(&root)?;
+    let dt_s = dt_ns as f64 * 1e-9;
+    let section = |key: &str| root.get(key).map(|field| field.table("a table")).transpose();
+    let (max_vehicles, max_time_s) = end(section("end")?.as_ref(), dt_s)?;
+    let vehicle = sections::vehicle(section("vehicle")?.as_ref())?;
+    let objective = root.need("objective", "a table with alpha or beta")?.table("a table")?;
+    let beta = sections::beta(&objective, &vehicle)?;
+    let control = sections::control(section("control")?.as_ref(), beta)?;
+
+    let road_tables = root.tables("roads", "a list of entry roads, at least one")?;
+    let zone_tables = root.tables("zones", "a list of zones, at least one")?;
+    for table in &road_tables {
+        table.only(&["name", "demand"])?;
+    }
+    for table in &zone_tables {
+        table.only(&["name", "flow", "approaches"])?;
+    }
+    let road_names = topology::unique_names(&road_tables, "road")?;
+    let zone_names = topology::unique_names(&zone_tables, "zone")?;
+    let step_m = vehicle.v_max_mps * dt_s;
+    let mut topology = topology::read(&zone_tables, &zone_names, &road_tables, &road_names, step_m)?;
+
+    let policies = topology.zones.iter().zip(&topology.declared).map(|(zone, &declared)| {
+        let downstream = match zone.exit {
+            super::Exit::Out => None,
+            super::Exit::Zone { zone, .. } => {
+                let zone = &topology.zones[zone as usize];
+                let lengths = zone.approaches.iter().map(|a| a.length_m);
+                Some(sections::Downstream { zone: &zone.name, longest_m: lengths.fold(0.0, f64::max) })
+            }
+        };
+        sections::flow(&zone_tables[declared], downstream.as_ref(), &vehicle)
+    });
+    let policies = policies.collect::<Result<Vec<_>, _>>()?;
+    for (zone, flow) in topology.zones.iter_mut().zip(policies) {
+        zone.flow = flow;
+    }
+
+    let mut reader = DemandReader { base, seed, roads: road_names, vehicle, traces: BTreeMap::new() };
+    let mut roads = Vec::with_capacity(road_tables.len());
+    for (index, (table, &(zone, path))) in road_tables.iter().zip(&topology.road_ends).enumerate() {
+        let demand = reader.read(index as u32, table)?;
+        roads.push(Road { name: reader.roads[index].to_owned(), zone, path, demand });
+    }
+    let network = Network { zones: topology.zones, roads };
+    Ok(Scenario { name, seed, dt_ns, max_vehicles, max_time_s, network, vehicle, control, beta })
+}
+
+/// `dt_s` as nanoseconds.
+fn dt_ns(root: &Table<'_>) -> Result<u64, ScenarioError> {
+    const EXPECTED: &str = "a step > 0 s that is a whole number of nanoseconds";
+    // Decimal fractions of a second are not exact in binary: a relative error of some bits is no fraction
+    // of a nanosecond.
+    let whole = |dt_s: f64| {
+        let ns = dt_s * 1e9;
+        dt_s > 0.0 && dt_s <= MAX_TIME_S && ns.round() >= 1.0 && (ns - ns.round()).abs() <= 1e-12 * ns
+    };
+    Ok((root.f64_or("dt_s", 0.1, whole, EXPECTED)? * 1e9).round() as u64)
+}
+
+/// `[end]`: greatest number of vehicles, and time in s.
+fn end(table: Option<&Table<'_>>, dt_s: f64) -> Result<(Option<u32>, f64), ScenarioError> {
+    const DEFAULT_TIME_S: f64 = 7200.0;
+    let Some(t) = table else { return Ok((None, DEFAULT_TIME_S)) };
+    t.only(&["vehicles", "time_s"])?;
+    let vehicles = match t.get("vehicles") {
+        Some(field) => Some(field.integer(1, "an integer from 1 to 4294967295")?),
+        None => None,
+    };
+    let time_ok = |time| time >= dt_s && time <= MAX_TIME_S;
+    let expected = format!("a time from dt_s = {dt_s} to {MAX_TIME_S:e} s");
+    Ok((vehicles, t.f64_or("time_s", DEFAULT_TIME_S, time_ok, &expected)?))
+}

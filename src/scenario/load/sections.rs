@@ -1,0 +1,258 @@
+//! Vehicle limits, objective, control law and flow policies.
+
+use super::error::ScenarioError;
+use super::table::Table;
+use crate::scenario::{
+    Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
+    Segment, Solver, VehicleParams,
+};
+
+/// `[vehicle]`, or the defaults.
+pub(super) fn vehicle(table: Option<&Table<'_>>) -> Result<VehicleParams, ScenarioError> {
+    let mut params = VehicleParams {
+        u_min_mps2: -4.0,
+        u_max_mps2: 4.0,
+        v_min_mps: 0.0,
+        v_max_mps: 30.0,
+        length_m: 4.5,
+        reaction_time_s: 1.8,
+        standstill_gap_m: 0.0,
+    };
+    let Some(t) = table else { return Ok(params) };
+    t.only(&[
+        "u_min_mps2",
+        "u_max_mps2",
+        "v_min_mps",
+        "v_max_mps",
+        "length_m",
+        "reaction_time_s",
+        "standstill_gap_m",
+    ])?;
+    let p = &mut params;
+    p.u_min_mps2 = t.f64_or("u_min_mps2", p.u_min_mps2, |u| u < 0.0, "an acceleration < 0 m/s^2")?;
+    p.u_max_mps2 = t.f64_or("u_max_mps2", p.u_max_mps2, |u| u > 0.0, "an acceleration > 0 m/s^2")?;
+    p.v_min_mps = t.f64_or("v_min_mps", p.v_min_mps, |v| v >= 0.0, "a speed >= 0 m/s")?;
+    let v_min = p.v_min_mps;
+    p.v_max_mps =
+        t.f64_or("v_max_mps", p.v_max_mps, |v| v > v_min, &format!("a speed > v_min_mps = {v_min} m/s"))?;
+    p.length_m = t.f64_or("length_m", p.length_m, |l| l > 0.0, "a length > 0 m")?;
+    p.reaction_time_s = t.f64_or("reaction_time_s", p.reaction_time_s, |r| r > 0.0, "a time > 0 s")?;
+    p.standstill_gap_m = t.f64_or("standstill_gap_m", p.standstill_gap_m, |g| g >= 0.0, "a gap >= 0 m")?;
+    Ok(params)
+}
+
+/// `[objective]`: beta, in m^2/s^4, given or from alpha.
+pub(super) fn beta(table: &Table<'_>, vehicle: &VehicleParams) -> Result<f64, ScenarioError> {
+    const ALPHA: &str = "a weight with 0 < alpha < 1";
+    const BETA: &str = "a weight > 0 m^2/s^4";
+    table.only(&["alpha", "beta"])?;
+    match table.either("alpha", "beta") {
+        (Some(_), Some(beta)) => {
+            Err(beta.bad_because(Some("alpha is given as well".into()), "either alpha or beta"))
+        }
+        (None, None) => Err(table.missing("beta", &format!("{BETA}, or alpha instead"))),
+        (None, Some(beta)) => beta.f64(|b| b > 0.0, BETA),
+        (Some(field), None) => {
+            let alpha = field.f64(|a| a > 0.0 && a < 1.0, ALPHA)?;
+            let u = vehicle.u_max_mps2.max(-vehicle.u_min_mps2);
+            let beta = alpha * u * u / (2.0 * (1.0 - alpha));
+            if beta.is_finite() && beta > 0.0 {
+                Ok(beta)
+            } else {
+                Err(field.bad_because(Some(format!("it gives beta = {beta}")), ALPHA))
+            }
+        }
+    }
+}
+
+/// `[control]`, or the defaults; `beta` is the default slack weight.
+pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlParams, ScenarioError> {
+    let mut params = ControlParams {
+        reference: ReferenceLaw::Corrected,
+        replan: Replan::FromEntry,
+        position_feedback: PositionFeedback::Approximate,
+        solver: Solver::ClosedForm,
+        safety_rows: SafetyRows::Continuous,
+        k_rear_end_per_s: 1.0,
+        k_merge_per_s: 1.0,
+        k_speed_per_s: 1.0,
+        clf_rate_per_s: 10.0,
+        slack_weight: beta,
+        clf: true,
+        feasibility_rows: true,
+        fe_conditions: FeConditions::Full,
+        fe_fraction: 0.25,
+    };
+    let Some(t) = table else { return Ok(params) };
+    t.only(&[
+        "reference",
+        "replan",
+        "position_feedback",
+        "solver",
+        "safety_rows",
+        "k_rear_end_per_s",
+        "k_merge_per_s",
+        "k_speed_per_s",
+        "clf_rate_per_s",
+        "slack_weight",
+        "clf",
+        "feasibility_rows",
+        "fe_conditions",
+        "fe_fraction",
+    ])?;
+    let gain = |key, default| t.f64_or(key, default, |k| k > 0.0, "a gain > 0 1/s");
+    let p = &mut params;
+    p.reference = t.choice_or_first(
+        "reference",
+        &[("corrected", ReferenceLaw::Corrected), ("as_printed", ReferenceLaw::AsPrinted)],
+    )?;
+    p.replan =
+        t.choice_or_first("replan", &[("from_entry", Replan::FromEntry), ("from_state", Replan::FromState)])?;
+    p.position_feedback = t.choice_or_first(
+        "position_feedback",
+        &[("approximate", PositionFeedback::Approximate), ("exact", PositionFeedback::Exact)],
+    )?;
+    p.solver =
+        t.choice_or_first("solver", &[("closed_form", Solver::ClosedForm), ("clarabel", Solver::Clarabel)])?;
+    p.safety_rows = t.choice_or_first(
+        "safety_rows",
+        &[("continuous", SafetyRows::Continuous), ("sampled", SafetyRows::Sampled)],
+    )?;
+    p.k_rear_end_per_s = gain("k_rear_end_per_s", p.k_rear_end_per_s)?;
+    p.k_merge_per_s = gain("k_merge_per_s", p.k_merge_per_s)?;
+    p.k_speed_per_s = gain("k_speed_per_s", p.k_speed_per_s)?;
+    p.clf_rate_per_s = gain("clf_rate_per_s", p.clf_rate_per_s)?;
+    p.slack_weight = t.f64_or("slack_weight", p.slack_weight, |w| w >= 0.0, "a weight >= 0")?;
+    p.clf = t.bool_or("clf", p.clf)?;
+    p.feasibility_rows = t.bool_or("feasibility_rows", p.feasibility_rows)?;
+    p.fe_conditions = t.choice_or_first(
+        "fe_conditions",
+        &[("full", FeConditions::Full), ("barrier", FeConditions::Barrier), ("off", FeConditions::Off)],
+    )?;
+    p.fe_fraction = t.f64_or(
+        "fe_fraction",
+        p.fe_fraction,
+        |f| f > 0.0 && f <= 1.0,
+        "a fraction with 0 < fe_fraction <= 1",
+    )?;
+    Ok(params)
+}
+
+/// What a zone's policy can observe: the lengths of the approaches of the zone downstream, if there is one.
+pub(super) struct Downstream<'a> {
+    pub(super) zone: &'a str,
+    pub(super) longest_m: f64,
+}
+
+/// `zones.*.flow`, or no flow control.
+pub(super) fn flow(
+    zone: &Table<'_>,
+    downstream: Option<&Downstream<'_>>,
+    vehicle: &VehicleParams,
+) -> Result<FlowPolicy, ScenarioError> {
+    #[derive(Clone, Copy, PartialEq)]
+    enum Kind {
+        None,
+        Fixed,
+        Feedback,
+        MeanSpeed,
+    }
+    let Some(field) = zone.get("flow") else { return Ok(FlowPolicy::None) };
+    const POLICY: &str = "a table such as {policy = \"fixed\", terminal_mps = 15}";
+    let mut t = field.table(POLICY)?;
+    let all = [
+        "policy",
+        "terminal_mps",
+        "baseline_mps",
+        "baseline_entry_speeds_mps",
+        "gain_mps",
+        "segment_m",
+        "min_mps",
+        "offset_mps",
+    ];
+    // Without a policy the other keys cannot be judged; a misspelt "policy" is still found here.
+    t.only(&all)?;
+    let policy = t.need("policy", "\"none\", \"fixed\", \"feedback\" or \"mean_speed\"")?;
+    let kind = policy.choice(&[
+        ("none", Kind::None),
+        ("fixed", Kind::Fixed),
+        ("feedback", Kind::Feedback),
+        ("mean_speed", Kind::MeanSpeed),
+    ])?;
+    let known: &[&str] = match kind {
+        Kind::None => &["policy"],
+        Kind::Fixed => &["policy", "terminal_mps"],
+        Kind::Feedback => {
+            &["policy", "baseline_mps", "baseline_entry_speeds_mps", "gain_mps", "segment_m", "min_mps"]
+        }
+        Kind::MeanSpeed => &["policy", "offset_mps", "gain_mps", "segment_m", "min_mps"],
+    };
+    t.only_or_stale(known, if policy.is_set() { &all } else { &[] })?;
+    t.blame(&policy);
+
+    let v_max = vehicle.v_max_mps;
+    let is_speed = |v| v > 0.0 && v <= v_max;
+    let speed = format!("a speed with 0 < v <= v_max_mps = {v_max} m/s");
+    if kind == Kind::None {
+        return Ok(FlowPolicy::None);
+    }
+    if kind == Kind::Fixed {
+        return Ok(FlowPolicy::Fixed { terminal_mps: t.f64("terminal_mps", is_speed, &speed)? });
+    }
+    let Some(downstream) = downstream else {
+        let problem = "the zone's exit leads out of the network, there is nothing to observe".to_owned();
+        return Err(policy.bad_because(Some(problem), "\"none\" or \"fixed\""));
+    };
+    let longest = downstream.longest_m;
+    let segment_ok = |l| l > 0.0 && l <= longest;
+    let segment = format!(
+        "a length with 0 < l <= {longest} m, the longest approach of the zone downstream, {}",
+        downstream.zone
+    );
+    let gain_mps = t.f64("gain_mps", |k| k > 0.0, "a gain > 0 m/s per vehicle")?;
+    let min_mps = t.f64_or("min_mps", 5.0, is_speed, &speed)?;
+    if kind == Kind::MeanSpeed {
+        return Ok(FlowPolicy::MeanSpeed {
+            offset_mps: t.f64("offset_mps", |_| true, "a finite speed difference in m/s")?,
+            gain_mps,
+            segment_m: t.f64("segment_m", segment_ok, &segment)?,
+            min_mps,
+        });
+    }
+    let segment = match t.get("segment_m") {
+        None => Segment::Whole,
+        Some(field) => Segment::First(field.f64(segment_ok, &segment)?),
+    };
+    Ok(FlowPolicy::Feedback { baseline: baseline(&t, v_max)?, gain_mps, segment, min_mps })
+}
+
+/// `baseline_mps`: a speed, or "optimal" with the entry speeds to take the mean over.
+fn baseline(t: &Table<'_>, v_max: f64) -> Result<Baseline, ScenarioError> {
+    let is_speed = |v| v > 0.0 && v <= v_max;
+    let speed = format!("a speed with 0 < v <= v_max_mps = {v_max} m/s");
+    let expected = format!("{speed}, or \"optimal\"");
+    let field = t.need("baseline_mps", &expected)?;
+    let samples = t.get("baseline_entry_speeds_mps");
+    if field.str("").is_ok_and(|word| word == "optimal") {
+        let list = format!("a list of speeds, each with 0 < v <= v_max_mps = {v_max} m/s");
+        let speeds: Vec<f64> = match samples {
+            Some(samples) => {
+                let items = samples.items(&list)?;
+                items.iter().map(|item| item.f64(is_speed, &speed)).collect::<Result<_, _>>()?
+            }
+            None => (10..=20).map(f64::from).filter(|&v| v <= v_max).collect(),
+        };
+        if speeds.is_empty() {
+            return Err(t.missing("baseline_entry_speeds_mps", &format!("{list} (the defaults exceed it)")));
+        }
+        return Ok(Baseline::Optimal(speeds));
+    }
+    let given = field.f64(is_speed, &expected)?;
+    match samples {
+        // Left over from the file's "optimal" when a --set gives the speed.
+        Some(samples) if samples.is_set() || !field.is_set() => {
+            Err(samples.bad_because(Some(format!("baseline_mps is {given}")), "it only with \"optimal\""))
+        }
+        _ => Ok(Baseline::Given(given)),
+    }
+}
