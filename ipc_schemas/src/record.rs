@@ -159,5 +159,5 @@ macro_rules! record {
 pub fn bytes_of<R: Record>(records: &[R]) -> &[u8] {
     // SAFETY: `record!` proves at compile time that a record has no padding and consists of plain
     // scalars, so every byte is initialised; u8 has no alignment; the length is that of the slice.
-    unsafe { core::slice::from_raw_parts(records.as_ptr().cast::<u8>(), core::mem::size_of_val(records)) }
+    unsafe { core::slice::from_raw_parts(records.as_ptr().cast::<u8>(), size_of_val(records)) }
 }

@@ -72,12 +72,11 @@ impl Gates {
     }
 }
 
-/// Whether a vehicle may enter at speed `v_mps` behind `leader`, `after_s` into the step, without an
-/// overlap that full braking could not prevent: should the leader brake to a stop, the newcomer, braking
-/// as hard one step later, must stop `gap_m` behind it.
+/// Whether a vehicle may enter at speed `v_mps` behind `leader`, `after_s` into the step, without
+/// overlapping it: now, or, should the leader keep its speed, in spite of braking fully from the next
+/// sample on. It is not asked to keep the reaction distance; enforcing that is the controllers' business.
 pub(super) fn may_enter(leader: &Held, after_s: f64, v_mps: f64, gap_m: f64, u_min_mps2: f64, dt_s: f64) -> bool {
-    let distance = leader.position_m(after_s);
-    let lead_v = leader.speed_mps(after_s);
-    let stopping = (v_mps * v_mps - lead_v * lead_v) / (2.0 * -u_min_mps2);
-    distance >= gap_m && distance >= gap_m + stopping + v_mps * dt_s
+    let closing_mps = (v_mps - leader.speed_mps(after_s)).max(0.0);
+    let needed_m = closing_mps * dt_s + closing_mps * closing_mps / (2.0 * -u_min_mps2);
+    leader.position_m(after_s) >= gap_m + needed_m
 }
