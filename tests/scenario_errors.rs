@@ -1,5 +1,7 @@
 //! Every bad input gives one message that names place, key path, value found and what was expected.
 
+#![allow(clippy::unwrap_used)]
+
 use control_zones::scenario::{Override, Scenario, ScenarioError, load, load_embedded, load_file};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -105,89 +107,359 @@ fn the_base_is_valid() {
 
 /// Text of the base, its replacement, and the message.
 const FILE_CASES: &[(&str, &str, &str)] = &[
-    //FILE
-    ("dt_s = 0.1", "dt_s = 0.1 0", ""),
-    ("dt_s = 0.1", "dt_s = 0.1\ndt_s = 0.2", ""),
-    ("dt_s = 0.1", "dts = 0.1", ""),
-    ("dt_s = 0.1", "dt_s = \"fast\"", ""),
-    ("dt_s = 0.1", "dt_s = 0", ""),
-    ("dt_s = 0.1", "dt_s = -0.1", ""),
-    ("dt_s = 0.1", "dt_s = nan", ""),
-    ("dt_s = 0.1", "dt_s = inf", ""),
-    ("dt_s = 0.1", "dt_s = 1e999", ""),
-    ("dt_s = 0.1", "dt_s = 0.3333333333333333", ""),
-    ("dt_s = 0.1", "dt_s = 1979-05-27", ""),
-    ("name = \"base\"\n", "", ""),
-    ("name = \"base\"", "name = \"a b\"", ""),
-    ("seed = 1", "seed = -1", ""),
-    ("seed = 1", "seed = 1.5", ""),
-    ("vehicles = 10", "vehicles = 0", ""),
-    ("vehicles = 10", "vehicles = 5000000000", ""),
-    ("vehicles = 10", "time_s = 0.01", ""),
-    ("v_max_mps = 30", "v_max_mps = 0", ""),
-    ("v_max_mps = 30", "v_min_mps = -1", ""),
-    ("v_max_mps = 30", "v_min_mps = 30", ""),
-    ("v_max_mps = 30", "u_min_mps2 = 0", ""),
-    ("v_max_mps = 30", "u_max_mps2 = -4", ""),
-    ("v_max_mps = 30", "v_max = 30", ""),
-    ("beta = 0.5\n", "", ""),
-    ("beta = 0.5", "beta = 0", ""),
-    ("beta = 0.5", "alpha = 0.5\nbeta = 0.5", ""),
-    ("beta = 0.5", "alpha = 1", ""),
-    ("k_merge_per_s = 1", "k_merge_per_s = 0", ""),
-    ("k_merge_per_s = 1", "slack_weight = -1", ""),
-    ("k_merge_per_s = 1", "reference = \"printed\"", ""),
-    ("k_merge_per_s = 1", "clf = 1", ""),
-    ("k_merge_per_s = 1", "fe_fraction = 1.5", ""),
-    ("name = \"north\"", "name = \"west\"", ""),
-    ("name = \"north\"", "name = 7", ""),
-    ("demand = { trace = \"arrivals.csv\" }\n", "", ""),
-    ("demand = { trace = \"arrivals.csv\" }", "demand = {}", ""),
-    ("demand = { trace = \"arrivals.csv\" }", "demand = \"arrivals.csv\"", ""),
-    ("{ trace = \"arrivals.csv\" }", "{ trace = \"missing.csv\" }", ""),
-    ("{ trace = \"arrivals.csv\" }", "{ trace = \"arrivals_{seed}.csv\" }", ""),
-    ("{ trace = \"arrivals.csv\" }", "{ trace = \"arrivals.csv\", speed_sd_mps = 1 }", ""),
-    ("min_headway_s = 1.2", "min_headway_s = 1.2\ntrace = \"arrivals.csv\"", ""),
-    ("min_headway_s = 1.2", "min_headway_s = 20", ""),
-    ("until_s = 20", "until_s = 10", ""),
-    ("vehicles_per_hour = 200", "vehicles_per_hour = -200", ""),
+    (
+        "dt_s = 0.1",
+        "dt_s = 0.1 0",
+        "s.toml:3: not valid TOML: string values must be quoted, expected literal string",
+    ),
+    ("dt_s = 0.1", "dt_s = 0.1\ndt_s = 0.2", "s.toml:4: not valid TOML: duplicate key"),
+    (
+        "dt_s = 0.1",
+        "dts = 0.1",
+        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, roads, zones; did you mean dt_s?",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = \"fast\"",
+        "s.toml:3: dt_s = \"fast\": expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = 0",
+        "s.toml:3: dt_s = 0: expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = -0.1",
+        "s.toml:3: dt_s = -0.1: expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = nan",
+        "s.toml:3: dt_s = nan: expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = inf",
+        "s.toml:3: dt_s = inf: expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = 1e999",
+        "s.toml:3: dt_s = 1e999: expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = 0.3333333333333333",
+        "s.toml:3: dt_s = 0.3333333333333333: expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt_s = 0.1",
+        "dt_s = 1979-05-27",
+        "s.toml:3: dt_s = 1979-05-27: expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "name = \"base\"\n",
+        "",
+        "s.toml:1: name: missing key; expected a name of 1 to 64 letters, digits, '_' or '-'",
+    ),
+    (
+        "name = \"base\"",
+        "name = \"a b\"",
+        "s.toml:1: name = \"a b\": expected a name of 1 to 64 letters, digits, '_' or '-'",
+    ),
+    ("seed = 1", "seed = -1", "s.toml:2: seed = -1: expected an integer from 0 to 2^64 - 1"),
+    ("seed = 1", "seed = 1.5", "s.toml:2: seed = 1.5: expected an integer from 0 to 2^64 - 1"),
+    ("vehicles = 10", "vehicles = 0", "s.toml:5: end.vehicles = 0: expected an integer from 1 to 4294967295"),
+    (
+        "vehicles = 10",
+        "vehicles = 5000000000",
+        "s.toml:5: end.vehicles = 5000000000: expected an integer from 1 to 4294967295",
+    ),
+    (
+        "vehicles = 10",
+        "time_s = 0.01",
+        "s.toml:5: end.time_s = 0.01: expected a time from dt_s = 0.1 to 1e9 s",
+    ),
+    (
+        "v_max_mps = 30",
+        "v_max_mps = 0",
+        "s.toml:7: vehicle.v_max_mps = 0: expected a speed > v_min_mps = 0 m/s",
+    ),
+    ("v_max_mps = 30", "v_min_mps = -1", "s.toml:7: vehicle.v_min_mps = -1: expected a speed >= 0 m/s"),
+    (
+        "v_max_mps = 30",
+        "v_min_mps = 30",
+        "s.toml:6: vehicle.v_max_mps: missing key; expected a speed > v_min_mps = 30 m/s (the default 30 is not)",
+    ),
+    (
+        "v_max_mps = 30",
+        "u_min_mps2 = 0",
+        "s.toml:7: vehicle.u_min_mps2 = 0: expected an acceleration < 0 m/s^2",
+    ),
+    (
+        "v_max_mps = 30",
+        "u_max_mps2 = -4",
+        "s.toml:7: vehicle.u_max_mps2 = -4: expected an acceleration > 0 m/s^2",
+    ),
+    (
+        "v_max_mps = 30",
+        "v_max = 30",
+        "s.toml:7: vehicle.v_max = 30: unknown key; expected one of u_min_mps2, u_max_mps2, v_min_mps, v_max_mps, length_m, reaction_time_s, standstill_gap_m; did you mean v_max_mps?",
+    ),
+    (
+        "beta = 0.5\n",
+        "",
+        "s.toml:8: objective.beta: missing key; expected a weight > 0 m^2/s^4, or alpha instead",
+    ),
+    ("beta = 0.5", "beta = 0", "s.toml:9: objective.beta = 0: expected a weight > 0 m^2/s^4"),
+    (
+        "beta = 0.5",
+        "alpha = 0.5\nbeta = 0.5",
+        "s.toml:10: objective.beta = 0.5: alpha is given as well; expected either alpha or beta",
+    ),
+    ("beta = 0.5", "alpha = 1", "s.toml:9: objective.alpha = 1: expected a weight with 0 < alpha < 1"),
+    (
+        "k_merge_per_s = 1",
+        "k_merge_per_s = 0",
+        "s.toml:11: control.k_merge_per_s = 0: expected a gain > 0 1/s",
+    ),
+    (
+        "k_merge_per_s = 1",
+        "slack_weight = -1",
+        "s.toml:11: control.slack_weight = -1: expected a weight >= 0",
+    ),
+    (
+        "k_merge_per_s = 1",
+        "reference = \"printed\"",
+        "s.toml:11: control.reference = \"printed\": expected \"corrected\" or \"as_printed\"",
+    ),
+    ("k_merge_per_s = 1", "clf = 1", "s.toml:11: control.clf = 1: expected true or false"),
+    (
+        "k_merge_per_s = 1",
+        "fe_fraction = 1.5",
+        "s.toml:11: control.fe_fraction = 1.5: expected a fraction with 0 < fe_fraction <= 1",
+    ),
+    (
+        "name = \"north\"",
+        "name = \"west\"",
+        "s.toml:16: roads.west.name = \"west\": used twice; expected a name no other road has",
+    ),
+    (
+        "name = \"north\"",
+        "name = 7",
+        "s.toml:16: roads.1.name = 7: expected a name of 1 to 64 letters, digits, '_' or '-'",
+    ),
+    (
+        "demand = { trace = \"arrivals.csv\" }\n",
+        "",
+        "s.toml:12: roads.west.demand: missing key; expected a table with trace = \"FILE.csv\", or with rates and the other keys of random arrivals",
+    ),
+    (
+        "demand = { trace = \"arrivals.csv\" }",
+        "demand = {}",
+        "s.toml:14: roads.west.demand.trace: missing key; expected trace = \"FILE.csv\", or rates = [...]",
+    ),
+    (
+        "demand = { trace = \"arrivals.csv\" }",
+        "demand = \"arrivals.csv\"",
+        "s.toml:14: roads.west.demand = \"arrivals.csv\": expected a table with trace = \"FILE.csv\", or with rates and the other keys of random arrivals",
+    ),
+    (
+        "{ trace = \"arrivals.csv\" }",
+        "{ trace = \"missing.csv\" }",
+        "s.toml:14: roads.west.demand.trace = \"missing.csv\": cannot read missing.csv: No such file or directory (os error 2); expected an arrival trace",
+    ),
+    (
+        "{ trace = \"arrivals.csv\" }",
+        "{ trace = \"arrivals_{seed}.csv\" }",
+        "s.toml:14: roads.west.demand.trace = \"arrivals_{seed}.csv\": cannot read arrivals_1.csv: No such file or directory (os error 2); expected an arrival trace for seed 1",
+    ),
+    (
+        "{ trace = \"arrivals.csv\" }",
+        "{ trace = \"arrivals.csv\", speed_sd_mps = 1 }",
+        "s.toml:14: roads.west.demand.speed_sd_mps = 1: unknown key; expected only trace",
+    ),
+    (
+        "min_headway_s = 1.2",
+        "min_headway_s = 1.2\ntrace = \"arrivals.csv\"",
+        "s.toml:18: roads.north.demand.rates = [{...}]: trace is given as well; expected either trace or rates",
+    ),
+    (
+        "min_headway_s = 1.2",
+        "min_headway_s = 20",
+        "s.toml:18: roads.north.demand.rates.1.vehicles_per_hour = 200: the mean headway would be 18.000 s, within min_headway_s = 20; expected a rate < 180.0 veh/h",
+    ),
+    (
+        "until_s = 20",
+        "until_s = 10",
+        "s.toml:18: roads.north.demand.rates.1.until_s = 10: expected an instant > 10 s, the end of the period before, and <= 1e9 s",
+    ),
+    (
+        "vehicles_per_hour = 200",
+        "vehicles_per_hour = -200",
+        "s.toml:18: roads.north.demand.rates.1.vehicles_per_hour = -200: expected a rate with 0 <= rate <= 36000 veh/h",
+    ),
     (
         "rates = [{ until_s = 10, vehicles_per_hour = 100 }, { until_s = 20, vehicles_per_hour = 200 }]",
         "rates = []",
-        "",
+        "s.toml:18: roads.north.demand.rates = []: expected a list of {until_s = TIME, vehicles_per_hour = RATE}",
     ),
-    ("speed_mean_mps = 16", "speed_mean_mps = 9", ""),
-    ("speed_sd_mps = 1", "speed_sd_mps = 11", ""),
-    ("speed_max_mps = 20", "speed_max_mps = 31", ""),
-    ("policy = \"feedback\"", "policy = \"feedbak\"", ""),
-    ("policy = \"feedback\"", "plicy = \"feedback\"", ""),
-    ("baseline_mps = 18", "baseline_mps = \"best\"", ""),
-    ("baseline_mps = 18", "baseline_mps = \"optimal\", baseline_entry_speeds_mps = [15, 0]", ""),
-    ("baseline_mps = 18", "baseline_mps = 18, baseline_entry_speeds_mps = [15]", ""),
-    ("gain_mps = 0.5", "gain_mps = -0.5", ""),
-    ("segment_m = 50", "segment_m = 151", ""),
-    ("policy = \"fixed\", terminal_mps = 15", "policy = \"feedback\", baseline_mps = 18, gain_mps = 1", ""),
-    ("policy = \"fixed\", terminal_mps = 15", "policy = \"fixed\"", ""),
-    ("policy = \"fixed\", terminal_mps = 15", "policy = \"fixed\", terminal_mps = 15, gain_mps = 1", ""),
-    ("terminal_mps = 15", "terminal_mps = 31", ""),
-    ("length_m = 200", "length_m = -200", ""),
-    ("length_m = 200", "length_m = 2.9", ""),
-    ("length_m = 200", "length_m = \"200 m\"", ""),
-    ("length_m = 200", "lenght_m = 200", ""),
-    ("link_m = 40", "link_m = 1", ""),
-    ("road = \"north\"", "road = \"nort\"", ""),
-    ("road = \"north\"", "road = \"west\"", ""),
-    ("road = \"north\"", "zone = \"first\"", ""),
-    ("road = \"north\"", "zone = \"third\"", ""),
-    ("road = \"north\"", "zone = \"second\"", ""),
-    ("road = \"north\"\n", "", ""),
-    ("road = \"north\"", "road = \"north\"\nzone = \"first\"", ""),
-    ("road = \"north\"", "road = \"north\"\nlink_m = 10", ""),
-    ("[[zones.approaches]]\nname = \"b\"\nlength_m = 100\nroad = \"north\"\n", "", ""),
-    ("road = \"west\"", "zone = \"second\"", ""),
-    ("name = \"b\"", "name = \"a\"", ""),
-    ("name = \"second\"", "name = \"first\"", ""),
-    //END
+    (
+        "speed_mean_mps = 16",
+        "speed_mean_mps = 9",
+        "s.toml:20: roads.north.demand.speed_mean_mps = 9: expected a speed from speed_min_mps = 10 to speed_max_mps = 20 m/s",
+    ),
+    (
+        "speed_sd_mps = 1",
+        "speed_sd_mps = 11",
+        "s.toml:21: roads.north.demand.speed_sd_mps = 11: expected a speed from 0 to speed_max_mps - speed_min_mps = 10 m/s",
+    ),
+    (
+        "speed_max_mps = 20",
+        "speed_max_mps = 31",
+        "s.toml:23: roads.north.demand.speed_max_mps = 31: expected a speed from speed_min_mps = 10 to v_max_mps = 30 m/s",
+    ),
+    (
+        "policy = \"feedback\"",
+        "policy = \"feedbak\"",
+        "s.toml:26: zones.first.flow.policy = \"feedbak\": expected \"none\" or \"fixed\" or \"feedback\" or \"mean_speed\"",
+    ),
+    (
+        "policy = \"feedback\"",
+        "plicy = \"feedback\"",
+        "s.toml:26: zones.first.flow.plicy = \"feedback\": unknown key; expected one of policy, terminal_mps, baseline_mps, baseline_entry_speeds_mps, gain_mps, segment_m, min_mps, offset_mps; did you mean policy?",
+    ),
+    (
+        "baseline_mps = 18",
+        "baseline_mps = \"best\"",
+        "s.toml:26: zones.first.flow.baseline_mps = \"best\": expected a speed with 0 < v <= v_max_mps = 30 m/s, or \"optimal\"",
+    ),
+    (
+        "baseline_mps = 18",
+        "baseline_mps = \"optimal\", baseline_entry_speeds_mps = [15, 0]",
+        "s.toml:26: zones.first.flow.baseline_entry_speeds_mps.1 = 0: expected a speed with 0 < v <= v_max_mps = 30 m/s",
+    ),
+    (
+        "baseline_mps = 18",
+        "baseline_mps = 18, baseline_entry_speeds_mps = [15]",
+        "s.toml:26: zones.first.flow.baseline_entry_speeds_mps = [15]: baseline_mps is 18; expected it only with \"optimal\"",
+    ),
+    (
+        "gain_mps = 0.5",
+        "gain_mps = -0.5",
+        "s.toml:26: zones.first.flow.gain_mps = -0.5: expected a gain > 0 m/s per vehicle",
+    ),
+    (
+        "segment_m = 50",
+        "segment_m = 151",
+        "s.toml:26: zones.first.flow.segment_m = 151: expected a length with 0 < l <= 150 m, the longest approach of the zone downstream, second",
+    ),
+    (
+        "policy = \"fixed\", terminal_mps = 15",
+        "policy = \"feedback\", baseline_mps = 18, gain_mps = 1",
+        "s.toml:33: zones.second.flow.policy = \"feedback\": the zone's exit leads out of the network, there is nothing to observe; expected \"none\" or \"fixed\"",
+    ),
+    (
+        "policy = \"fixed\", terminal_mps = 15",
+        "policy = \"fixed\"",
+        "s.toml:33: zones.second.flow.terminal_mps: missing key; expected a speed with 0 < v <= v_max_mps = 30 m/s",
+    ),
+    (
+        "policy = \"fixed\", terminal_mps = 15",
+        "policy = \"fixed\", terminal_mps = 15, gain_mps = 1",
+        "s.toml:33: zones.second.flow.gain_mps = 1: unknown key; expected one of policy, terminal_mps",
+    ),
+    (
+        "terminal_mps = 15",
+        "terminal_mps = 31",
+        "s.toml:33: zones.second.flow.terminal_mps = 31: expected a speed with 0 < v <= v_max_mps = 30 m/s",
+    ),
+    (
+        "length_m = 200",
+        "length_m = -200",
+        "s.toml:29: zones.first.approaches.a.length_m = -200: expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+    ),
+    (
+        "length_m = 200",
+        "length_m = 2.9",
+        "s.toml:29: zones.first.approaches.a.length_m = 2.9: expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+    ),
+    (
+        "length_m = 200",
+        "length_m = \"200 m\"",
+        "s.toml:29: zones.first.approaches.a.length_m = \"200 m\": expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+    ),
+    (
+        "length_m = 200",
+        "lenght_m = 200",
+        "s.toml:29: zones.first.approaches.a.lenght_m = 200: unknown key; expected one of name, length_m, road, zone, link_m; did you mean length_m?",
+    ),
+    (
+        "link_m = 40",
+        "link_m = 1",
+        "s.toml:38: zones.second.approaches.a.link_m = 1: expected 0 (no link), or a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+    ),
+    (
+        "road = \"north\"",
+        "road = \"nort\"",
+        "s.toml:42: zones.second.approaches.b.road = \"nort\": unknown road; expected the name of a road: west, north; did you mean north?",
+    ),
+    (
+        "road = \"north\"",
+        "road = \"west\"",
+        "s.toml:42: zones.second.approaches.b.road = \"west\": zones.first.approaches.a.road uses this road already; expected a road no other approach uses",
+    ),
+    (
+        "road = \"north\"",
+        "zone = \"first\"",
+        "s.toml:42: zones.second.approaches.b.zone = \"first\": zones.second.approaches.a.zone claims the exit of this zone already; expected a zone whose exit leads nowhere else",
+    ),
+    (
+        "road = \"north\"",
+        "zone = \"third\"",
+        "s.toml:42: zones.second.approaches.b.zone = \"third\": unknown zone; expected the name of a zone: first, second",
+    ),
+    (
+        "road = \"north\"",
+        "zone = \"second\"",
+        "s.toml:42: zones.second.approaches.b.zone = \"second\": cycle in the network: second -> second; expected zones without a cycle",
+    ),
+    (
+        "road = \"north\"\n",
+        "",
+        "s.toml:39: zones.second.approaches.b.road: missing key; expected a source: road = \"NAME\", or zone = \"NAME\" upstream",
+    ),
+    (
+        "road = \"north\"",
+        "road = \"north\"\nzone = \"first\"",
+        "s.toml:43: zones.second.approaches.b.zone = \"first\": road is given as well; expected one source, either road or zone",
+    ),
+    (
+        "road = \"north\"",
+        "road = \"north\"\nlink_m = 10",
+        "s.toml:43: zones.second.approaches.b.link_m = 10: the source is a road; expected link_m only with zone",
+    ),
+    (
+        "[[zones.approaches]]\nname = \"b\"\nlength_m = 100\nroad = \"north\"\n",
+        "",
+        "s.toml:16: roads.north.name = \"north\": no approach uses this road; expected an approach with this road as its source",
+    ),
+    (
+        "road = \"west\"",
+        "zone = \"second\"",
+        "s.toml:37: zones.second.approaches.a.zone = \"first\": cycle in the network: first -> second -> first; expected zones without a cycle",
+    ),
+    (
+        "name = \"b\"",
+        "name = \"a\"",
+        "s.toml:40: zones.second.approaches.a.name = \"a\": used twice; expected a name no other approach of the zone has",
+    ),
+    (
+        "name = \"second\"",
+        "name = \"first\"",
+        "s.toml:32: zones.first.name = \"first\": used twice; expected a name no other zone has",
+    ),
 ];
 
 #[test]
@@ -201,32 +473,84 @@ fn bad_files() {
 
 /// What follows `--set`, and the message.
 const SET_CASES: &[(&str, &str)] = &[
-    //SET
-    ("dt_s", ""),
-    ("=1", ""),
-    ("end..vehicles=1", ""),
-    ("objective={beta=1", ""),
-    ("dt_s=0", ""),
-    ("dt_s=0.1s", ""),
-    ("dt=0.1", ""),
-    ("network.size=3", ""),
-    ("control.replan=from_stat", ""),
-    ("zones.frist.flow.policy=none", ""),
-    ("zones.2.flow.policy=none", ""),
-    ("zones.first.flow.terminal_mps=15", ""),
-    ("zones.first.flow.policy=fixed", ""),
-    ("zones.first.flow={policy=\"fixed\",terminal_mps=-15}", ""),
-    ("zones.second.flow={policy=\"mean_speed\",offset_mps=1,gain_mps=1,segment_m=50}", ""),
-    ("zones.second.approaches.b.length_m=1", ""),
-    ("dt_s.x=1", ""),
-    ("roads.west.demand.trace=none.csv", ""),
-    ("objective.alpha=2", ""),
-    ("zones=[]", ""),
-    ("roads.west.demand.rates=[{until_s=1,vehicles_per_hour=1}]", ""),
-    ("zones.first.approaches.a.zone=second", ""),
-    ("zones.second.approaches.b.zone=second", ""),
-    ("a.a.a.a.a.a.a.a.a.a.a.a.a.a.a.a.a=1", ""),
-    //END
+    ("dt_s", "--set dt_s: no '='; expected key=value"),
+    ("=1", "--set =1: empty key; expected a dotted key such as end.vehicles"),
+    ("end..vehicles=1", "--set end..vehicles=1: empty key; expected a dotted key such as end.vehicles"),
+    (
+        "objective={beta=1",
+        "--set objective={beta=1: not valid TOML: unclosed inline table, expected `}`; expected a TOML value",
+    ),
+    ("dt_s=0", "--set dt_s=0: dt_s = 0: expected a step > 0 s that is a whole number of nanoseconds"),
+    (
+        "dt_s=0.1s",
+        "--set dt_s=0.1s: dt_s = \"0.1s\": expected a step > 0 s that is a whole number of nanoseconds",
+    ),
+    (
+        "dt=0.1",
+        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, roads, zones; did you mean dt_s?",
+    ),
+    (
+        "network.size=3",
+        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, roads, zones",
+    ),
+    (
+        "control.replan=from_stat",
+        "--set control.replan=from_stat: control.replan = \"from_stat\": expected \"from_entry\" or \"from_state\"",
+    ),
+    (
+        "zones.frist.flow.policy=none",
+        "--set zones.frist.flow.policy=none: zones has no element frist; expected first, second, or an index from 0 to 1; did you mean first?",
+    ),
+    (
+        "zones.2.flow.policy=none",
+        "--set zones.2.flow.policy=none: zones has no element 2; expected first, second, or an index from 0 to 1",
+    ),
+    (
+        "zones.first.flow.terminal_mps=15",
+        "--set zones.first.flow.terminal_mps=15: zones.first.flow.terminal_mps = 15: unknown key; expected one of policy, baseline_mps, baseline_entry_speeds_mps, gain_mps, segment_m, min_mps; did you mean min_mps?",
+    ),
+    (
+        "zones.first.flow.policy=fixed",
+        "--set zones.first.flow.policy=fixed: zones.first.flow.terminal_mps: missing key; expected a speed with 0 < v <= v_max_mps = 30 m/s",
+    ),
+    (
+        "zones.first.flow={policy=\"fixed\",terminal_mps=-15}",
+        "--set zones.first.flow={policy=\"fixed\",terminal_mps=-15}: zones.first.flow.terminal_mps = -15: expected a speed with 0 < v <= v_max_mps = 30 m/s",
+    ),
+    (
+        "zones.second.flow={policy=\"mean_speed\",offset_mps=1,gain_mps=1,segment_m=50}",
+        "--set zones.second.flow={policy=\"mean_speed\",offset_mps=1,gain_mps=1,segment_m=50}: zones.second.flow.policy = \"mean_speed\": the zone's exit leads out of the network, there is nothing to observe; expected \"none\" or \"fixed\"",
+    ),
+    (
+        "zones.second.approaches.b.length_m=1",
+        "--set zones.second.approaches.b.length_m=1: zones.second.approaches.b.length_m = 1: expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+    ),
+    ("dt_s.x=1", "--set dt_s.x=1: dt_s = 0.1: has no keys; expected a table"),
+    (
+        "roads.west.demand.trace=none.csv",
+        "--set roads.west.demand.trace=none.csv: roads.west.demand.trace = \"none.csv\": cannot read none.csv: No such file or directory (os error 2); expected an arrival trace",
+    ),
+    (
+        "objective.alpha=2",
+        "--set objective.alpha=2: objective.alpha = 2: expected a weight with 0 < alpha < 1",
+    ),
+    ("zones=[]", "--set zones=[]: zones = []: expected a list of zones, at least one"),
+    (
+        "roads.west.demand.rates=[{until_s=1,vehicles_per_hour=1}]",
+        "--set roads.west.demand.rates=[{until_s=1,vehicles_per_hour=1}]: roads.west.demand.min_headway_s: missing key; expected a time >= 0 s",
+    ),
+    (
+        "zones.first.approaches.a.zone=second",
+        "--set zones.first.approaches.a.zone=second: zones.first.approaches.a.zone = \"second\": cycle in the network: first -> second -> first; expected zones without a cycle",
+    ),
+    (
+        "zones.second.approaches.b.zone=second",
+        "--set zones.second.approaches.b.zone=second: zones.second.approaches.b.zone = \"second\": cycle in the network: second -> second; expected zones without a cycle",
+    ),
+    (
+        "a.a.a.a.a.a.a.a.a.a.a.a.a.a.a.a.a=1",
+        "--set a.a.a.a.a.a.a.a.a.a.a.a.a.a.a.a.a=1: expected a key of at most 16 parts",
+    ),
 ];
 
 #[test]
@@ -241,19 +565,44 @@ fn bad_sets() {
 
 /// A trace, and the message.
 const TRACE_CASES: &[(&str, &str)] = &[
-    //TRACE
-    ("", ""),
-    ("time,road,speed\n", ""),
-    ("time_s,road,speed_mps\n0,west,15\n1,west\n", ""),
-    ("time_s,road,speed_mps\n0,west,15\n\n1,west,15,4\n", ""),
-    ("time_s,road,speed_mps\n0,west,15\n1,west,fast\n", ""),
-    ("time_s,road,speed_mps\n0,west,15\n1;5,west,15\n", ""),
-    ("time_s,road,speed_mps\nnan,west,15\n", ""),
-    ("time_s,road,speed_mps\n-1,west,15\n", ""),
-    ("time_s,road,speed_mps\n2,west,15\n1.5,north,15\n", ""),
-    ("time_s,road,speed_mps\n0,wset,15\n", ""),
-    ("time_s,road,speed_mps\n0,west,31\n", ""),
-    //END
+    ("", "arrivals.csv:1: an empty file: expected the header time_s,road,speed_mps"),
+    ("time,road,speed\n", "arrivals.csv:1: \"time,road,speed\": expected the header time_s,road,speed_mps"),
+    (
+        "time_s,road,speed_mps\n0,west,15\n1,west\n",
+        "arrivals.csv:3: \"1,west\": expected three columns, time_s,road,speed_mps",
+    ),
+    (
+        "time_s,road,speed_mps\n0,west,15\n\n1,west,15,4\n",
+        "arrivals.csv:4: \"1,west,15,4\": expected three columns, time_s,road,speed_mps",
+    ),
+    (
+        "time_s,road,speed_mps\n0,west,15\n1,west,fast\n",
+        "arrivals.csv:3: speed_mps = \"fast\": expected a speed within the vehicles' 0 to 30 m/s",
+    ),
+    (
+        "time_s,road,speed_mps\n0,west,15\n1;5,west,15\n",
+        "arrivals.csv:3: time_s = \"1;5\": expected an instant from 0 to 1e9 s",
+    ),
+    (
+        "time_s,road,speed_mps\nnan,west,15\n",
+        "arrivals.csv:2: time_s = \"nan\": expected an instant from 0 to 1e9 s",
+    ),
+    (
+        "time_s,road,speed_mps\n-1,west,15\n",
+        "arrivals.csv:2: time_s = \"-1\": expected an instant from 0 to 1e9 s",
+    ),
+    (
+        "time_s,road,speed_mps\n2,west,15\n1.5,north,15\n",
+        "arrivals.csv:3: time_s = \"1.5\": out of order; expected an instant >= 2 s, that of the row before",
+    ),
+    (
+        "time_s,road,speed_mps\n0,wset,15\n",
+        "arrivals.csv:2: road = \"wset\": unknown road; expected one of west, north; did you mean west?",
+    ),
+    (
+        "time_s,road,speed_mps\n0,west,31\n",
+        "arrivals.csv:2: speed_mps = \"31\": expected a speed within the vehicles' 0 to 30 m/s",
+    ),
 ];
 
 #[test]

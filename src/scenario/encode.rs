@@ -52,6 +52,7 @@ pub fn scenario_hash(scenario: &Scenario) -> u64 {
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::*;
     use crate::scenario::{embedded_names, load_embedded};

@@ -51,14 +51,12 @@ pub(super) struct Document {
 impl Document {
     /// Parses the text of a scenario file; `file` is its name in messages.
     pub(super) fn parse(file: &str, text: &str) -> Result<Self, ScenarioError> {
+        let lines = Lines::new(text);
         let table = DeTable::parse(text).map_err(|e| ScenarioError::Syntax {
-            place: Place::Line {
-                file: file.to_owned(),
-                line: line_of(text, e.span().map_or(0, |s| s.start)),
-            },
+            place: Place::Line { file: file.to_owned(), line: lines.of(e.span().map_or(0, |s| s.start)) },
             message: one_line(e.message()),
         })?;
-        let origin = |offset| Origin::Line(line_of(text, offset));
+        let origin = |offset| Origin::Line(lines.of(offset));
         let root =
             Node { origin: Origin::Line(1), value: Value::Table(convert_table(table.get_ref(), &origin)) };
         Ok(Self { file: file.to_owned(), sets: Vec::new(), root })
@@ -114,10 +112,18 @@ fn convert(value: &Spanned<DeValue<'_>>, origin: &dyn Fn(usize) -> Origin) -> No
     Node { origin: origin(value.span().start), value: converted }
 }
 
-/// Line number, from 1, of a byte offset.
-fn line_of(text: &str, offset: usize) -> u64 {
-    let before = &text.as_bytes()[..offset.min(text.len())];
-    1 + before.iter().filter(|&&b| b == b'\n').count() as u64
+/// Byte offsets at which lines end.
+struct Lines(Vec<usize>);
+
+impl Lines {
+    fn new(text: &str) -> Self {
+        Self(text.bytes().enumerate().filter(|(_, b)| *b == b'\n').map(|(i, _)| i).collect())
+    }
+
+    /// Line number, from 1, of a byte offset.
+    fn of(&self, offset: usize) -> u64 {
+        1 + self.0.partition_point(|end| *end < offset) as u64
+    }
 }
 
 fn one_line(message: &str) -> String {

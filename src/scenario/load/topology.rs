@@ -212,23 +212,26 @@ fn sort(
     // A zone has one exit, so what is left over are cycles and nothing else: following exits from any of
     // them comes back to it.
     let next = |zone: usize| claims.exits[zone].map_or(start, |(next, ..)| next as usize);
-    let mut cycle = vec![names[start]];
+    let mut members = vec![start];
     let mut zone = next(start);
-    while zone != start && cycle.len() <= names.len() {
-        cycle.push(names[zone]);
+    while zone != start && members.len() <= names.len() {
+        members.push(zone);
         zone = next(zone);
     }
-    cycle.push(names[start]);
-    let field = claims.exit_fields[start].as_ref().expect("a zone of a cycle has an exit that was claimed");
+    // The connection to name is the one a --set made, if one did.
+    let is_set = |zone: &usize| claims.exit_fields[*zone].as_ref().is_some_and(Field::is_set);
+    let blamed = members.iter().copied().find(is_set).unwrap_or(start);
+    let field = claims.exit_fields[blamed].as_ref().expect("a zone of a cycle has an exit that was claimed");
     Err(ScenarioError::Cycle {
         place: field.place(),
         key: field.path.as_str().into(),
         found: field.found().into(),
-        cycle: cycle.join(" -> ").into(),
+        cycle: members.iter().chain([&start]).map(|z| names[*z]).collect::<Vec<_>>().join(" -> ").into(),
     })
 }
 
 #[cfg(test)]
+#[allow(clippy::unwrap_used)]
 mod tests {
     use super::super::{TraceBase, load_text};
     use crate::scenario::{Exit, Scenario, Source, load_embedded};
