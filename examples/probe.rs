@@ -10,7 +10,34 @@ fn main() {
         run.run().unwrap();
         let e = t.elapsed();
         let w = run.world().summary();
-        println!("seed {seed} steps {} hash {:x} {:?}/step arrived {} departed {} held {} total {:.3}", w.steps, w.state_hash, e / w.steps as u32, w.arrived, w.departed, w.held_arrivals, w.zones.iter().map(|z| z.mean_objective).sum::<f64>());
-        for z in w.zones { println!("  {} n {} t {:.3} e {:.3} J {:.3} fe {} {:.2}s inf {} rear {:?} merge {:?} clean {:?} {:?} ov {} {}", z.zone, z.vehicles, z.mean_time_s, z.mean_energy, z.mean_objective, z.fe_vehicles, z.fe_mean_s, z.infeasible_vehicles, z.min_rear_end_margin_m, z.min_merge_margin_m, z.min_rear_end_margin_clean_m, z.min_merge_margin_clean_m, z.order_violations, z.overtakes); }
+        println!(
+            "seed {seed} steps {} hash {:x} {:?}/step arrived {} departed {} held {} total {:.3}",
+            w.steps,
+            w.state_hash,
+            e / w.steps as u32,
+            w.arrived,
+            w.departed,
+            w.held_arrivals,
+            w.zones.iter().map(|z| z.mean_objective).sum::<f64>()
+        );
+        for z in w.zones {
+            println!(
+                "  {} n {} t {:.3} e {:.3} J {:.3} fe {} {:.2}s inf {} rear {:?} merge {:?} clean {:?} {:?} ov {} {}",
+                z.zone,
+                z.vehicles,
+                z.mean_time_s,
+                z.mean_energy,
+                z.mean_objective,
+                z.fe_vehicles,
+                z.fe_mean_s,
+                z.infeasible_vehicles,
+                z.min_rear_end_margin_m,
+                z.min_merge_margin_m,
+                z.min_rear_end_margin_clean_m,
+                z.min_merge_margin_clean_m,
+                z.order_violations,
+                z.overtakes
+            );
+        }
     }
 }

@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0xcac7ab8f128d95bc)
+#define CZ_SCHEMA_HASH UINT64_C(0xeaf7954ac66f38b2)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -87,6 +87,11 @@
 #define CZ_ANY_INDEX UINT16_C(65535)
 /** `cz_attach_request_t.scenario_hash`: no scenario of one's own, take the world's. */
 #define CZ_ANY_SCENARIO UINT64_C(0)
+/** `cz_attach_request_t.phase`: asks for admission. */
+#define CZ_ATTACH_JOIN UINT32_C(1)
+/** `cz_attach_request_t.phase`: has been admitted, has opened its ends of the services, and can
+ *  start. */
+#define CZ_ATTACH_READY UINT32_C(2)
 /** `cz_attach_reply_t.status`: welcome; the other fields and the scenario bytes are valid. */
 #define CZ_ATTACH_ACCEPTED UINT32_C(0)
 /** `cz_attach_reply_t.status`: the participant's schema hash is not the world's. */
@@ -100,8 +105,8 @@
 
 /** World -> controllers: `cz_vehicle_state_t` of every step. */
 #define CZ_SERVICE_STATE "cz/state"
-/** World -> coordinators: `cz_vehicle_state_t`, only of the steps they act in. */
-#define CZ_SERVICE_COORDINATOR_STATE "cz/coordinator-state"
+/** World -> coordinator `i`: `cz_vehicle_state_t`, only of the steps it acts in; `i` is appended. */
+#define CZ_SERVICE_COORDINATOR_STATE_PREFIX "cz/coordinator-state/"
 /** Coordinators -> controllers: `cz_assignment_t` of the steps they act in. */
 #define CZ_SERVICE_COORDINATION "cz/coordination"
 /** Coordinators -> coordinator `i`: `cz_zone_summary_t`; `i` is appended. */
@@ -335,10 +340,11 @@ CZ_ASSERT_(vehicle_command_binding_rows_offset, offsetof(cz_vehicle_command_t, b
 CZ_ASSERT_(vehicle_command_mode_offset, offsetof(cz_vehicle_command_t, mode) == 92);
 CZ_ASSERT_(vehicle_command_verdict_offset, offsetof(cz_vehicle_command_t, verdict) == 94);
 
-/** Participant -> world: let me in.
+/** Participant -> world: let me in; later, I am ready.
  *
- *  Repeated until answered. `instance` is drawn at random by the participant and tells its answer
- *  from those to others. */
+ *  Repeated until answered. The other services are opened only between the two, so that a
+ *  participant of another schema is refused before its frames could be misread. `instance` is drawn
+ *  at random by the participant and tells its answer from those to others. */
 typedef struct cz_attach_request {
     /** Random number that names this participant. */
     uint64_t instance;
@@ -352,8 +358,12 @@ typedef struct cz_attach_request {
     uint16_t role;
     /** Index wanted among the processes of the role, or 65535 for any. */
     uint16_t wanted_index;
+    /** 1 join, 2 ready. */
+    uint32_t phase;
+    /** Index assigned in the reply to the join; 0 while joining. */
+    uint32_t index;
 } cz_attach_request_t;
-CZ_ASSERT_(attach_request_size, sizeof(cz_attach_request_t) == 32);
+CZ_ASSERT_(attach_request_size, sizeof(cz_attach_request_t) == 40);
 CZ_ASSERT_ALIGN_(cz_attach_request_t, 8);
 CZ_ASSERT_(attach_request_instance_offset, offsetof(cz_attach_request_t, instance) == 0);
 CZ_ASSERT_(attach_request_schema_hash_offset, offsetof(cz_attach_request_t, schema_hash) == 8);
@@ -361,6 +371,8 @@ CZ_ASSERT_(attach_request_scenario_hash_offset, offsetof(cz_attach_request_t, sc
 CZ_ASSERT_(attach_request_process_id_offset, offsetof(cz_attach_request_t, process_id) == 24);
 CZ_ASSERT_(attach_request_role_offset, offsetof(cz_attach_request_t, role) == 28);
 CZ_ASSERT_(attach_request_wanted_index_offset, offsetof(cz_attach_request_t, wanted_index) == 30);
+CZ_ASSERT_(attach_request_phase_offset, offsetof(cz_attach_request_t, phase) == 32);
+CZ_ASSERT_(attach_request_index_offset, offsetof(cz_attach_request_t, index) == 36);
 
 /** World -> participant: the answer. The payload of the frame is the encoded scenario. */
 typedef struct cz_attach_reply {

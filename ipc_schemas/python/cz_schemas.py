@@ -11,7 +11,7 @@ import ctypes
 import sys
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0xcac7ab8f128d95bc
+SCHEMA_HASH = 0xeaf7954ac66f38b2
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -65,6 +65,10 @@ VERDICT_INFEASIBLE = 3
 ANY_INDEX = 65535
 #: `AttachRequest.scenario_hash`: no scenario of one's own, take the world's.
 ANY_SCENARIO = 0
+#: `AttachRequest.phase`: asks for admission.
+ATTACH_JOIN = 1
+#: `AttachRequest.phase`: has been admitted, has opened its ends of the services, and can start.
+ATTACH_READY = 2
 #: `AttachReply.status`: welcome; the other fields and the scenario bytes are valid.
 ATTACH_ACCEPTED = 0
 #: `AttachReply.status`: the participant's schema hash is not the world's.
@@ -78,8 +82,8 @@ ATTACH_BAD_ROLE = 4
 
 #: World → controllers: `VehicleState` of every step.
 SERVICE_STATE = "cz/state"
-#: World → coordinators: `VehicleState`, only of the steps they act in.
-SERVICE_COORDINATOR_STATE = "cz/coordinator-state"
+#: World → coordinator `i`: `VehicleState`, only of the steps it acts in; `i` is appended.
+SERVICE_COORDINATOR_STATE_PREFIX = "cz/coordinator-state/"
 #: Coordinators → controllers: `Assignment` of the steps they act in.
 SERVICE_COORDINATION = "cz/coordination"
 #: Coordinators → coordinator `i`: `ZoneSummary`; `i` is appended.
@@ -302,10 +306,11 @@ class VehicleCommand(ctypes.Structure):
 
 
 class AttachRequest(ctypes.Structure):
-    """Participant → world: let me in.
+    """Participant → world: let me in; later, I am ready.
 
-    Repeated until answered. `instance` is drawn at random by the participant and tells its answer
-    from those to others.
+    Repeated until answered. The other services are opened only between the two, so that a
+    participant of another schema is refused before its frames could be misread. `instance` is drawn
+    at random by the participant and tells its answer from those to others.
 
     Fields:
         instance: Random number that names this participant.
@@ -314,6 +319,8 @@ class AttachRequest(ctypes.Structure):
         process_id: Process id, for liveness checks and messages.
         role: 2 coordinator, 3 controller.
         wanted_index: Index wanted among the processes of the role, or 65535 for any.
+        phase: 1 join, 2 ready.
+        index: Index assigned in the reply to the join; 0 while joining.
     """
 
     _fields_ = [
@@ -323,6 +330,8 @@ class AttachRequest(ctypes.Structure):
         ("process_id", ctypes.c_uint32),
         ("role", ctypes.c_uint16),
         ("wanted_index", ctypes.c_uint16),
+        ("phase", ctypes.c_uint32),
+        ("index", ctypes.c_uint32),
     ]
 
     @staticmethod
@@ -476,7 +485,7 @@ _LAYOUTS = {
         },
     ),
     AttachRequest: (
-        32,
+        40,
         8,
         {
             "instance": 0,
@@ -485,6 +494,8 @@ _LAYOUTS = {
             "process_id": 24,
             "role": 28,
             "wanted_index": 30,
+            "phase": 32,
+            "index": 36,
         },
     ),
     AttachReply: (

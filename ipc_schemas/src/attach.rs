@@ -1,4 +1,4 @@
-//! How a participant joins a run: a request, answered once.
+//! How a participant joins a run: a request, answered by the world.
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 
@@ -10,6 +10,11 @@ codes! {
     pub const ANY_INDEX: u16 = u16::MAX;
     /// [`AttachRequest::scenario_hash`]: no scenario of one's own, take the world's.
     pub const ANY_SCENARIO: u64 = 0;
+
+    /// [`AttachRequest::phase`]: asks for admission.
+    pub const ATTACH_JOIN: u32 = 1;
+    /// [`AttachRequest::phase`]: has been admitted, has opened its ends of the services, and can start.
+    pub const ATTACH_READY: u32 = 2;
 
     /// [`AttachReply::status`]: welcome; the other fields and the scenario bytes are valid.
     pub const ATTACH_ACCEPTED: u32 = 0;
@@ -24,9 +29,10 @@ codes! {
 }
 
 record! {
-    /// Participant → world: let me in.
+    /// Participant → world: let me in; later, I am ready.
     ///
-    /// Repeated until answered. `instance` is drawn at random by the participant and tells its
+    /// Repeated until answered. The other services are opened only between the two, so that a
+    /// participant of another schema is refused before its frames could be misread. `instance` is drawn at random by the participant and tells its
     /// answer from those to others.
     #[type_name("cz.AttachRequest.v1")]
     pub struct AttachRequest {
@@ -42,6 +48,10 @@ record! {
         pub role: u16,
         /// Index wanted among the processes of the role, or 65535 for any.
         pub wanted_index: u16,
+        /// 1 join, 2 ready.
+        pub phase: u32,
+        /// Index assigned in the reply to the join; 0 while joining.
+        pub index: u32,
     }
 }
 

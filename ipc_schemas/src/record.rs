@@ -91,7 +91,14 @@ pub struct Layout {
 ///
 /// Every bit pattern is a valid value (plain scalars only), which is what lets a receiver look at a
 /// frame before having validated it.
-pub trait Record: Copy + Default + core::fmt::Debug + Send + 'static {
+pub trait Record:
+    Copy
+    + Default
+    + core::fmt::Debug
+    + Send
+    + iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend
+    + 'static
+{
     /// The record's layout.
     const LAYOUT: Layout;
 }

@@ -102,7 +102,7 @@ const GOLDEN: [Golden; 7] = [
     ),
     (
         "cz.AttachRequest.v1",
-        32,
+        40,
         &[
             ("instance", "u64", 0),
             ("schema_hash", "u64", 8),
@@ -110,6 +110,8 @@ const GOLDEN: [Golden; 7] = [
             ("process_id", "u32", 24),
             ("role", "u16", 28),
             ("wanted_index", "u16", 30),
+            ("phase", "u32", 32),
+            ("index", "u32", 36),
         ],
     ),
     (
@@ -132,7 +134,7 @@ const GOLDEN: [Golden; 7] = [
 ];
 
 /// XXH3-64 of the schema text of [`GOLDEN`].
-const GOLDEN_HASH: u64 = 0xcac7_ab8f_128d_95bc;
+const GOLDEN_HASH: u64 = 0xeaf7_954a_c66f_38b2;
 
 fn crate_dir() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

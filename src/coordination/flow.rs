@@ -22,8 +22,8 @@ impl FlowController {
         let baseline_mps = match &zone.flow {
             FlowPolicy::Feedback { baseline: Baseline::Given(speed), .. } => *speed,
             FlowPolicy::Feedback { baseline: Baseline::Optimal(entry_speeds), .. } => {
-                let mean_length_m = zone.approaches.iter().map(|a| a.length_m).sum::<f64>()
-                    / zone.approaches.len() as f64;
+                let mean_length_m =
+                    zone.approaches.iter().map(|a| a.length_m).sum::<f64>() / zone.approaches.len() as f64;
                 mean_optimal_terminal_speed_mps(scenario, mean_length_m, entry_speeds)
             }
             _ => 0.0,

@@ -1,8 +1,8 @@
 //! A whole run in one thread: every driver in turn, over the memory transport.
 
 use super::{
-    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity, LockstepError, Progress,
-    WorldDriver, WorldPorts,
+    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity, LockstepError,
+    Progress, WorldDriver, WorldPorts,
 };
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
@@ -38,16 +38,17 @@ impl InProcess {
         let zones = scenario.network.zones.len() as u32;
         let run_id = 1;
         let mut state = MemoryService::new(frames::SERVICE_STATE);
-        let mut coordinator_state = MemoryService::new(frames::SERVICE_COORDINATOR_STATE);
         let mut coordination = MemoryService::new(frames::SERVICE_COORDINATION);
         let mut command = MemoryService::new(frames::SERVICE_COMMAND);
+        let mut coordinator_states: Vec<MemoryService<VehicleState>> =
+            (0..coordinators).map(|_| MemoryService::new(frames::SERVICE_COORDINATOR_STATE_PREFIX)).collect();
         let mut summaries: Vec<MemoryService<ZoneSummary>> =
             (0..coordinators).map(|_| MemoryService::new(frames::SERVICE_SUMMARY_PREFIX)).collect();
         // All inboxes before any outbox.
         let controller_inboxes: Vec<_> =
             (0..controllers).map(|_| (state.inbox(), coordination.inbox())).collect();
         let coordinator_inboxes: Vec<_> =
-            summaries.iter_mut().map(|s| (coordinator_state.inbox(), s.inbox())).collect();
+            coordinator_states.iter_mut().zip(&mut summaries).map(|(c, s)| (c.inbox(), s.inbox())).collect();
         let command_inbox = command.inbox();
         let masks = neighbour_coordinators(&scenario.network, coordinators);
         let identity = |role, index| Identity { run_id, role, index: index as u16, generation: 0 };
@@ -80,12 +81,12 @@ impl InProcess {
             .collect();
         let ports = WorldPorts {
             state: state.outbox(),
-            coordinator_state: coordinator_state.outbox(),
+            coordinator_states: coordinator_states.iter().map(MemoryService::outbox).collect(),
             command: command_inbox,
         };
         let world = World::new(scenario.clone(), coordinators);
         InProcess {
-            world: WorldDriver::new(world, ports, run_id, controllers, coordinators),
+            world: WorldDriver::new(world, ports, run_id, controllers),
             coordinators: coordinators_side,
             controllers: controllers_side,
         }

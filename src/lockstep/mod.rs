@@ -2,12 +2,11 @@
 //!
 //! Each role has a driver: a state machine around the pure role that takes what has arrived, sends what
 //! is due, and says whom it waits for. Drivers never block; how to wait is the caller's business
-//! ([`wait`] between processes, a simple round in [`in_process`]).
+//! (the `process` module between processes, a simple round in [`in_process`]).
 
 mod controller;
 mod coordinator;
 pub mod in_process;
-pub mod wait;
 mod world;
 
 pub use controller::{ControllerDriver, ControllerPorts};

@@ -10,8 +10,8 @@ use ipc_schemas::{ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, Role, VehicleCom
 pub struct WorldPorts<S, C, M> {
     /// State frames to controllers, every step.
     pub state: S,
-    /// State frames to coordinators, only of the steps they act in.
-    pub coordinator_state: C,
+    /// State frames to each coordinator process, only of the steps it acts in.
+    pub coordinator_states: Vec<C>,
     /// Commands from controllers.
     pub command: M,
 }
@@ -23,7 +23,6 @@ pub struct WorldDriver<S, C, M> {
     ports: WorldPorts<S, C, M>,
     identity: Identity,
     controllers: u32,
-    coordinators: u32,
     /// Generation of each controller process.
     controller_generations: Vec<u32>,
     phase: Phase,
@@ -48,14 +47,12 @@ where
         ports: WorldPorts<S, C, M>,
         run_id: u64,
         controllers: u32,
-        coordinators: u32,
     ) -> WorldDriver<S, C, M> {
         WorldDriver {
             world,
             ports,
             identity: Identity { run_id, role: Role::World, index: 0, generation: 0 },
             controllers,
-            coordinators,
             controller_generations: vec![0; controllers as usize],
             phase: Phase::Publish,
         }
@@ -90,15 +87,16 @@ where
         };
         let count = self.world.record_count();
         // Coordinators first: theirs is the longer way.
-        if masks.acting != 0 || finished {
-            let world = &self.world;
-            let loan = self.ports.coordinator_state.loan(header, count, |slots| {
-                world.records().for_each(|r| slots.push(r));
-            })?;
-            check_reached("the coordinators' state frame", step, loan.send()?, self.coordinators, finished)?;
+        for (index, outbox) in self.ports.coordinator_states.iter_mut().enumerate() {
+            if finished || masks.acting >> index & 1 == 1 {
+                let world = &self.world;
+                let loan = outbox.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
+                check_reached("a coordinator's state frame", step, loan.send()?, 1, finished)?;
+            }
         }
         let world = &self.world;
-        let loan = self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
+        let loan =
+            self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
         self.world.seal(loan.records());
         check_reached("the state frame", step, loan.send()?, self.controllers, finished)?;
         self.phase =
@@ -109,7 +107,12 @@ where
     fn collect(&mut self, mut missing: u64) -> Result<Progress, LockstepError> {
         let step = self.world.step();
         let Some(frame) = self.ports.command.receive()? else {
-            return Ok(Progress::Waiting(Awaited { role: Role::Controller, missing, what: "commands", step }));
+            return Ok(Progress::Waiting(Awaited {
+                role: Role::Controller,
+                missing,
+                what: "commands",
+                step,
+            }));
         };
         let header = frame.header();
         let index = header.sender_index;
@@ -120,9 +123,11 @@ where
         if u32::from(index) >= self.controllers || missing >> index & 1 == 0 {
             return Err(LockstepError::Unexpected { sender: sender(header), step });
         }
-        self.world
-            .command(frame.records())
-            .map_err(|fault| LockstepError::Command { step, sender: sender(header), fault })?;
+        self.world.command(frame.records()).map_err(|fault| LockstepError::Command {
+            step,
+            sender: sender(header),
+            fault,
+        })?;
         missing &= !(1 << index);
         if missing == 0 {
             self.world.advance().map_err(|vehicles| LockstepError::Uncommanded { step, vehicles })?;

@@ -30,7 +30,11 @@ impl Gates {
     pub(super) fn new(scenario: &Scenario) -> Gates {
         let roads = &scenario.network.roads;
         let mut gates = Gates {
-            streams: roads.iter().zip(0..).map(|(road, i)| ArrivalStream::new(road, i, scenario.seed)).collect(),
+            streams: roads
+                .iter()
+                .zip(0..)
+                .map(|(road, i)| ArrivalStream::new(road, i, scenario.seed))
+                .collect(),
             pending: vec![None; roads.len()],
             next: BinaryHeap::with_capacity(roads.len()),
             waiting: vec![VecDeque::new(); roads.len()],
@@ -75,7 +79,14 @@ impl Gates {
 /// Whether a vehicle may enter at speed `v_mps` behind `leader`, `after_s` into the step, without
 /// overlapping it: now, or, should the leader keep its speed, in spite of braking fully from the next
 /// sample on. It is not asked to keep the reaction distance; enforcing that is the controllers' business.
-pub(super) fn may_enter(leader: &Held, after_s: f64, v_mps: f64, gap_m: f64, u_min_mps2: f64, dt_s: f64) -> bool {
+pub(super) fn may_enter(
+    leader: &Held,
+    after_s: f64,
+    v_mps: f64,
+    gap_m: f64,
+    u_min_mps2: f64,
+    dt_s: f64,
+) -> bool {
     let closing_mps = (v_mps - leader.speed_mps(after_s)).max(0.0);
     let needed_m = closing_mps * dt_s + closing_mps * closing_mps / (2.0 * -u_min_mps2);
     leader.position_m(after_s) >= gap_m + needed_m

@@ -54,8 +54,7 @@ impl World {
             }
             let Exit::Zone { zone: down, path, link_m } = scenario.network.zones[zone].exit else { continue };
             let last = self.zones[down as usize].cars.iter().rev().find(|c| c.path == path);
-            let mut leader =
-                last.map(|c| Held::new(c.held.x0_m + link_m, c.held.v0_mps, c.held.u_mps2));
+            let mut leader = last.map(|c| Held::new(c.held.x0_m + link_m, c.held.v0_mps, c.held.u_mps2));
             for car in &mut self.links[zone].cars {
                 let k = scenario.control.k_rear_end_per_s;
                 let u = link::drive(car, leader.as_ref(), &scenario.vehicle, k, dt_s);
@@ -99,7 +98,8 @@ impl World {
             metrics.order_violations += u32::from(kept > 0 || !first);
             let mut visit = car.visit;
             visit.energy += car.held.energy(after_s);
-            let previous = if i > 0 { Some(&traffic.cars[i - 1]) } else { traffic.left.as_ref().map(|l| &l.car) };
+            let previous =
+                if i > 0 { Some(&traffic.cars[i - 1]) } else { traffic.left.as_ref().map(|l| &l.car) };
             // `cars[i - 1]` may have been overwritten by compaction only with itself or an earlier
             // member, which is the case of an order violation.
             let merge_margin_m = previous.filter(|p| p.path != car.path).map(|p| {
@@ -253,8 +253,7 @@ fn account_margins(
         let (before, rest) = traffic.cars.split_at_mut(i);
         let car = &mut rest[0];
         let left = traffic.left.as_ref().map(|l| &l.car);
-        let ahead =
-            before.iter().rev().find(|c| c.path == car.path).or(left.filter(|c| c.path == car.path));
+        let ahead = before.iter().rev().find(|c| c.path == car.path).or(left.filter(|c| c.path == car.path));
         if car.entered {
             let previous = before.last().or(left).filter(|c| c.path != car.path);
             note_entry_conditions(scenario, zone, car, ahead, previous);

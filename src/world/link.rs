@@ -16,7 +16,13 @@ const RECOVERY_S: f64 = 2.0;
 
 /// The acceleration a vehicle on a link chooses: back to its entry speed, unless the sampled rear-end
 /// condition asks for less. `leader` is the motion of the vehicle ahead, in the link's coordinate.
-pub(super) fn drive(car: &Car, leader: Option<&Held>, vehicle: &VehicleParams, k_per_s: f64, dt_s: f64) -> f64 {
+pub(super) fn drive(
+    car: &Car,
+    leader: Option<&Held>,
+    vehicle: &VehicleParams,
+    k_per_s: f64,
+    dt_s: f64,
+) -> f64 {
     let wish = (car.entry_speed_mps - car.v_mps) / RECOVERY_S;
     let Some(leader) = leader else { return wish.clamp(vehicle.u_min_mps2, vehicle.u_max_mps2) };
     let rear_end = RearEnd {

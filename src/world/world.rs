@@ -181,9 +181,10 @@ impl World {
                 let now = if l.left_now { frames::STATE_LEFT_NOW } else { 0 };
                 record(&l.car, zone as u32, frames::STATE_LEFT | now)
             });
-            let members = traffic.cars.iter().map(move |c| {
-                record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 })
-            });
+            let members = traffic
+                .cars
+                .iter()
+                .map(move |c| record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 }));
             left.chain(members)
         });
         let on_links = self

@@ -209,7 +209,7 @@ pub(super) fn flow(
         "a length with 0 < l <= {longest} m, the longest approach of the zone downstream, {}",
         downstream.zone
     );
-    let gain_mps = t.f64("gain_mps", |k| k > 0.0, "a gain > 0 m/s per vehicle")?;
+    let gain_mps = t.f64("gain_mps", |k| k >= 0.0, "a gain >= 0 m/s per vehicle")?;
     let min_mps = t.f64_or("min_mps", 5.0, is_speed, &speed)?;
     if kind == Kind::MeanSpeed {
         return Ok(FlowPolicy::MeanSpeed {

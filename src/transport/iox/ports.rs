@@ -1,0 +1,119 @@
+//! The boxes over iceoryx2 ports.
+
+use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::port::{LoanError, SendError};
+use iceoryx2::sample::Sample;
+use iceoryx2::sample_mut::SampleMut;
+use iceoryx2::service::ipc;
+use ipc_schemas::{FrameHeader, Record};
+use std::marker::PhantomData;
+
+/// The sending end of a service.
+#[derive(Debug)]
+pub struct IoxOutbox<R: Record> {
+    service: String,
+    publisher: Publisher<ipc::Service, [R], FrameHeader>,
+}
+
+impl<R: Record> IoxOutbox<R> {
+    pub(super) fn new(service: String, publisher: Publisher<ipc::Service, [R], FrameHeader>) -> Self {
+        IoxOutbox { service, publisher }
+    }
+}
+
+impl<R: Record> Outbox<R> for IoxOutbox<R> {
+    type Loan<'a> = IoxLoan<'a, R>;
+
+    fn loan(
+        &mut self,
+        header: FrameHeader,
+        count: usize,
+        fill: impl FnOnce(&mut Slots<'_, R>),
+    ) -> Result<IoxLoan<'_, R>, TransportError> {
+        let mut sample = self.publisher.loan_slice_uninit(count).map_err(|error| match error {
+            LoanError::ExceedsMaxLoans => {
+                unreachable!("a loan borrows the outbox, so there is never a second one")
+            }
+            other => self.failed(&other),
+        })?;
+        *sample.user_header_mut() = FrameHeader { record_count: count as u32, ..header };
+        let mut slots = Slots::new(sample.payload_mut());
+        fill(&mut slots);
+        slots.assert_full();
+        // SAFETY: `assert_full` has established that all `count` records have been written.
+        let sample = unsafe { sample.assume_init() };
+        Ok(IoxLoan { service: &self.service, sample, outbox: PhantomData })
+    }
+}
+
+impl<R: Record> IoxOutbox<R> {
+    fn failed(&self, error: &dyn std::fmt::Debug) -> TransportError {
+        TransportError::Failed { service: self.service.clone(), reason: format!("{error:?}") }
+    }
+}
+
+/// A frame being written in shared memory.
+#[derive(Debug)]
+pub struct IoxLoan<'a, R: Record> {
+    service: &'a str,
+    sample: SampleMut<ipc::Service, [R], FrameHeader>,
+    outbox: PhantomData<&'a mut ()>,
+}
+
+impl<R: Record> Loan<R> for IoxLoan<'_, R> {
+    fn records(&self) -> &[R] {
+        self.sample.payload()
+    }
+
+    fn send(self) -> Result<usize, TransportError> {
+        let service = self.service;
+        self.sample.send().map_err(|error| match error {
+            SendError::UnableToDeliver => TransportError::ReceiverFull { service: service.to_owned() },
+            other => TransportError::Failed { service: service.to_owned(), reason: format!("{other:?}") },
+        })
+    }
+}
+
+/// The receiving end of a service.
+#[derive(Debug)]
+pub struct IoxInbox<R: Record> {
+    service: String,
+    subscriber: Subscriber<ipc::Service, [R], FrameHeader>,
+}
+
+impl<R: Record> IoxInbox<R> {
+    pub(super) fn new(service: String, subscriber: Subscriber<ipc::Service, [R], FrameHeader>) -> Self {
+        IoxInbox { service, subscriber }
+    }
+}
+
+impl<R: Record> Inbox<R> for IoxInbox<R> {
+    type Frame = IoxFrame<R>;
+
+    fn receive(&mut self) -> Result<Option<IoxFrame<R>>, TransportError> {
+        match self.subscriber.receive() {
+            Ok(sample) => Ok(sample.map(|sample| IoxFrame { sample })),
+            Err(error) => {
+                Err(TransportError::Failed { service: self.service.clone(), reason: format!("{error:?}") })
+            }
+        }
+    }
+}
+
+/// A frame where it lies in shared memory.
+#[derive(Debug)]
+pub struct IoxFrame<R: Record> {
+    sample: Sample<ipc::Service, [R], FrameHeader>,
+}
+
+impl<R: Record> Frame<R> for IoxFrame<R> {
+    fn header(&self) -> &FrameHeader {
+        self.sample.user_header()
+    }
+
+    fn records(&self) -> &[R] {
+        self.sample.payload()
+    }
+}

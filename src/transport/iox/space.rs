@@ -1,0 +1,462 @@
+//! The shared-memory space of one run: its node, its services, and their removal.
+//!
+//! A run has a directory of its own and a file-name prefix of its own; both derive from the run's name.
+//! Whoever leaves last removes both, including the one global file iceoryx2 leaves behind.
+
+use super::ports::{IoxInbox, IoxOutbox};
+use crate::transport::TransportError;
+use iceoryx2::config::Config;
+use iceoryx2::port::BackpressureAction;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::{
+    AllocationStrategy, CallbackProgression, LogLevel, Node, NodeBuilder, NodeState, SemanticString,
+    ServiceName, SignalHandlingMode, set_log_level,
+};
+use iceoryx2::sample::Sample;
+use iceoryx2::service::builder::publish_subscribe::{PublishSubscribeCreateError, PublishSubscribeOpenError};
+use iceoryx2::service::ipc;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use ipc_schemas::{AttachReply, AttachRequest, FrameHeader, Record, SERVICE_ATTACH, SERVICE_ATTACH_REPLY};
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+/// A valid run name: 1 to 32 characters of `[A-Za-z0-9_-]`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RunName(String);
+
+/// Not a run name.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{name:?} is not a run name; expected 1 to 32 letters, digits, '-' or '_'")]
+pub struct RunNameError {
+    /// What was given.
+    pub name: String,
+}
+
+impl FromStr for RunName {
+    type Err = RunNameError;
+
+    fn from_str(name: &str) -> Result<RunName, RunNameError> {
+        let valid = (1..=32).contains(&name.len())
+            && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
+        if valid { Ok(RunName(name.to_owned())) } else { Err(RunNameError { name: name.to_owned() }) }
+    }
+}
+
+impl std::fmt::Display for RunName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// Why the space of a run could not be entered or used.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum SpaceError {
+    /// The run's world has not created the service (yet).
+    #[error("service {service} does not exist")]
+    NoService {
+        /// Service name.
+        service: String,
+    },
+    /// Another world has created the service.
+    #[error("service {service} exists already")]
+    Exists {
+        /// Service name.
+        service: String,
+    },
+    /// The other side declares the service with another record type or with other limits.
+    #[error("service {service} is declared differently by the other side: {reason}")]
+    Incompatible {
+        /// Service name.
+        service: String,
+        /// What iceoryx2 said.
+        reason: String,
+    },
+    /// iceoryx2 or the file system failed.
+    #[error("{what}: {reason}")]
+    Failed {
+        /// What was attempted.
+        what: String,
+        /// What was said.
+        reason: String,
+    },
+}
+
+fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
+    SpaceError::Failed { what: what.to_owned(), reason: format!("{reason:?}") }
+}
+
+/// How many ports of a service there may be. Each send walks all subscriber slots, so these are tight.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ServiceLimits {
+    /// Publishers.
+    pub publishers: usize,
+    /// Subscribers.
+    pub subscribers: usize,
+    /// Processes.
+    pub nodes: usize,
+}
+
+/// An open service of a run.
+#[derive(Debug)]
+pub struct Service<R: Record> {
+    name: String,
+    factory: PortFactory<ipc::Service, [R], FrameHeader>,
+}
+
+impl<R: Record> Service<R> {
+    /// A sending port for frames of about `expected_records`; longer frames make it grow.
+    pub fn outbox(&self, expected_records: usize) -> Result<IoxOutbox<R>, SpaceError> {
+        let publisher = self
+            .factory
+            .publisher_builder()
+            .max_loaned_samples(1)
+            .initial_max_slice_len(expected_records.max(1))
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            // In lockstep a full receiver is a fault, not something to wait for.
+            .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
+            .create()
+            .map_err(|e| failed(&format!("create a publisher of {}", self.name), &e))?;
+        Ok(IoxOutbox::new(self.name.clone(), publisher))
+    }
+
+    /// A receiving port.
+    pub fn inbox(&self) -> Result<IoxInbox<R>, SpaceError> {
+        let subscriber = self
+            .factory
+            .subscriber_builder()
+            .create()
+            .map_err(|e| failed(&format!("create a subscriber of {}", self.name), &e))?;
+        Ok(IoxInbox::new(self.name.clone(), subscriber))
+    }
+}
+
+/// Membership in a run's space. Dropped, it leaves; the last to leave removes everything.
+#[derive(Debug)]
+pub struct RunSpace {
+    // Declared first so that it is dropped before the files are swept.
+    node: Option<Node<ipc::Service>>,
+    config: Config,
+    run: RunName,
+    directory: PathBuf,
+}
+
+/// Frames in flight per connection: in lockstep one is being read while the next arrives.
+const BUFFER: usize = 2;
+
+impl RunSpace {
+    /// Enters the space of a run, creating it when nobody else has.
+    pub fn enter(run: &RunName) -> Result<RunSpace, SpaceError> {
+        // Everything iceoryx2 reports comes back as an error value, which says it better.
+        set_log_level(LogLevel::Fatal);
+        let base = base_directory()?;
+        let directory = base.join(run.to_string());
+        private_directory(&directory)?;
+        let config = config(run, &directory)?;
+        let node = NodeBuilder::new()
+            .config(&config)
+            .signal_handling_mode(SignalHandlingMode::Disabled)
+            .create::<ipc::Service>()
+            .map_err(|e| failed("create a node", &e))?;
+        node.try_cleanup_dead_nodes();
+        Ok(RunSpace { node: Some(node), config, run: run.clone(), directory })
+    }
+
+    fn node(&self) -> &Node<ipc::Service> {
+        self.node.as_ref().expect("the node is only taken when the space is dropped")
+    }
+
+    /// Creates a service as the run's world.
+    pub fn create<R: Record>(&self, name: &str, limits: ServiceLimits) -> Result<Service<R>, SpaceError> {
+        let factory = self
+            .node()
+            .service_builder(&service_name(name)?)
+            .publish_subscribe::<[R]>()
+            .user_header::<FrameHeader>()
+            .enable_safe_overflow(false)
+            .history_size(0)
+            .subscriber_max_buffer_size(BUFFER)
+            .subscriber_max_borrowed_samples(BUFFER)
+            .max_publishers(limits.publishers)
+            .max_subscribers(limits.subscribers)
+            .max_nodes(limits.nodes)
+            .create()
+            .map_err(|e| create_error(name, e))?;
+        Ok(Service { name: name.to_owned(), factory })
+    }
+
+    /// Opens a service the world has created.
+    pub fn open<R: Record>(&self, name: &str) -> Result<Service<R>, SpaceError> {
+        let factory = self
+            .node()
+            .service_builder(&service_name(name)?)
+            .publish_subscribe::<[R]>()
+            .user_header::<FrameHeader>()
+            .open()
+            .map_err(|e| open_error(name, e))?;
+        Ok(Service { name: name.to_owned(), factory })
+    }
+
+    /// Opens the world's side of attaching.
+    pub fn create_attach_desk(
+        &self,
+        participants: usize,
+        reply_bytes: usize,
+    ) -> Result<AttachDesk, SpaceError> {
+        // Refused participants take slots too, until they leave.
+        let slots = participants + 8;
+        let requests = self
+            .node()
+            .service_builder(&service_name(SERVICE_ATTACH)?)
+            .publish_subscribe::<AttachRequest>()
+            .subscriber_max_buffer_size(4)
+            .max_publishers(slots)
+            .max_subscribers(1)
+            .max_nodes(slots + 1)
+            .create()
+            .map_err(|e| create_error(SERVICE_ATTACH, e))?;
+        let replies = self
+            .node()
+            .service_builder(&service_name(SERVICE_ATTACH_REPLY)?)
+            .publish_subscribe::<[u8]>()
+            .user_header::<AttachReply>()
+            .subscriber_max_buffer_size(4)
+            .max_publishers(1)
+            .max_subscribers(slots)
+            .max_nodes(slots + 1)
+            .create()
+            .map_err(|e| create_error(SERVICE_ATTACH_REPLY, e))?;
+        Ok(AttachDesk {
+            requests: requests
+                .subscriber_builder()
+                .create()
+                .map_err(|e| failed("subscribe to attach requests", &e))?,
+            replies: replies
+                .publisher_builder()
+                .initial_max_slice_len(reply_bytes)
+                .create()
+                .map_err(|e| failed("publish attach replies", &e))?,
+        })
+    }
+
+    /// Opens a participant's side of attaching.
+    pub fn open_attach_line(&self) -> Result<AttachLine, SpaceError> {
+        let requests = self
+            .node()
+            .service_builder(&service_name(SERVICE_ATTACH)?)
+            .publish_subscribe::<AttachRequest>()
+            .open()
+            .map_err(|e| open_error(SERVICE_ATTACH, e))?;
+        let replies = self
+            .node()
+            .service_builder(&service_name(SERVICE_ATTACH_REPLY)?)
+            .publish_subscribe::<[u8]>()
+            .user_header::<AttachReply>()
+            .open()
+            .map_err(|e| open_error(SERVICE_ATTACH_REPLY, e))?;
+        Ok(AttachLine {
+            replies: replies
+                .subscriber_builder()
+                .create()
+                .map_err(|e| failed("subscribe to attach replies", &e))?,
+            requests: requests
+                .publisher_builder()
+                .create()
+                .map_err(|e| failed("publish attach requests", &e))?,
+        })
+    }
+
+    /// Removes what processes killed in this run have left, while others go on.
+    pub fn sweep_dead(&self) {
+        self.node().try_cleanup_dead_nodes();
+    }
+
+    /// Removes everything a run has left when none of its processes lives any more; does nothing
+    /// otherwise. Returns whether the space is now empty.
+    pub fn sweep(run: &RunName) -> Result<bool, SpaceError> {
+        set_log_level(LogLevel::Fatal);
+        let directory = base_directory()?.join(run.to_string());
+        if !directory.exists() {
+            return Ok(true);
+        }
+        let config = config(run, &directory)?;
+        Ok(sweep(&config, run, &directory))
+    }
+}
+
+impl Drop for RunSpace {
+    fn drop(&mut self) {
+        drop(self.node.take());
+        sweep(&self.config, &self.run, &self.directory);
+    }
+}
+
+/// Removes the run's files unless a process of it is still alive. Two processes that leave at the same
+/// time may both find nobody else and both remove; neither minds a file that is gone already.
+fn sweep(config: &Config, run: &RunName, directory: &Path) -> bool {
+    let mut alive = false;
+    let listed = Node::<ipc::Service>::list(config, |state| {
+        match state {
+            NodeState::Dead(view) => {
+                let _ = view.try_remove_stale_resources();
+            }
+            NodeState::Alive(_) | NodeState::Inaccessible(_) => alive = true,
+            NodeState::Undefined(_) => {}
+        }
+        CallbackProgression::Continue
+    });
+    if alive || listed.is_err() {
+        return false;
+    }
+    let prefix = prefix(run);
+    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+        if entry.file_name().to_string_lossy().starts_with(&prefix) {
+            let _ = std::fs::remove_file(entry.path());
+        }
+    }
+    let _ = std::fs::remove_dir_all(directory);
+    if let Some(base) = directory.parent() {
+        // Succeeds for the last run only, which is just what is wanted.
+        let _ = std::fs::remove_dir(base);
+    }
+    true
+}
+
+/// File-name prefix of a run's shared memory. The user id keeps users apart; the two separators keep a
+/// run `a` from matching the files of a run `a-b`.
+fn prefix(run: &RunName) -> String {
+    format!("cz_{}_{run}__", rustix::process::getuid().as_raw())
+}
+
+/// The directory under which each run has its own: in the user's runtime directory where there is one.
+fn base_directory() -> Result<PathBuf, SpaceError> {
+    let base = match std::env::var_os("XDG_RUNTIME_DIR") {
+        Some(runtime) if Path::new(&runtime).is_dir() => PathBuf::from(runtime).join("cz"),
+        _ => std::env::temp_dir().join(format!("cz-{}", rustix::process::getuid().as_raw())),
+    };
+    private_directory(&base)?;
+    Ok(base)
+}
+
+fn private_directory(path: &Path) -> Result<(), SpaceError> {
+    use std::os::unix::fs::{DirBuilderExt, MetadataExt};
+    std::fs::DirBuilder::new()
+        .recursive(true)
+        .mode(0o700)
+        .create(path)
+        .map_err(|e| failed(&format!("create {}", path.display()), &e))?;
+    let owner = std::fs::metadata(path).map_err(|e| failed(&format!("read {}", path.display()), &e))?.uid();
+    if owner == rustix::process::getuid().as_raw() {
+        Ok(())
+    } else {
+        Err(failed(&format!("use {}", path.display()), &format!("it belongs to user {owner}")))
+    }
+}
+
+fn config(run: &RunName, directory: &Path) -> Result<Config, SpaceError> {
+    let mut config = Config::default();
+    let path = directory.to_string_lossy();
+    let path = iceoryx2::prelude::Path::new(path.as_bytes())
+        .map_err(|e| failed(&format!("use the directory {path}"), &e))?;
+    config.global.set_root_path(&path);
+    config.global.prefix = iceoryx2::prelude::FileName::new(prefix(run).as_bytes())
+        .map_err(|e| failed("form a file-name prefix", &e))?;
+    Ok(config)
+}
+
+fn service_name(name: &str) -> Result<ServiceName, SpaceError> {
+    ServiceName::new(name).map_err(|e| failed(&format!("form the service name {name}"), &e))
+}
+
+fn create_error(name: &str, error: PublishSubscribeCreateError) -> SpaceError {
+    match error {
+        PublishSubscribeCreateError::AlreadyExists => SpaceError::Exists { service: name.to_owned() },
+        other => failed(&format!("create service {name}"), &other),
+    }
+}
+
+fn open_error(name: &str, error: PublishSubscribeOpenError) -> SpaceError {
+    use PublishSubscribeOpenError as Open;
+    let service = name.to_owned();
+    match error {
+        // A service that is being created or removed will exist or not exist a moment later.
+        Open::DoesNotExist | Open::IsMarkedForDestruction | Open::HangsInCreation => {
+            SpaceError::NoService { service }
+        }
+        Open::IncompatibleTypes
+        | Open::IncompatibleMessagingPattern
+        | Open::IncompatibleAttributes
+        | Open::ExceedsMaxNumberOfNodes => SpaceError::Incompatible { service, reason: format!("{error:?}") },
+        other => failed(&format!("open service {name}"), &other),
+    }
+}
+
+/// The world's side of attaching.
+#[derive(Debug)]
+pub struct AttachDesk {
+    requests: Subscriber<ipc::Service, AttachRequest, ()>,
+    replies: Publisher<ipc::Service, [u8], AttachReply>,
+}
+
+impl AttachDesk {
+    /// The next request, if there is one.
+    pub fn next_request(&self) -> Result<Option<AttachRequest>, TransportError> {
+        match self.requests.receive() {
+            Ok(sample) => Ok(sample.map(|s| *s.payload())),
+            Err(e) => Err(attach_failure(SERVICE_ATTACH, &e)),
+        }
+    }
+
+    /// Answers a request with the scenario's bytes behind the reply.
+    pub fn reply(&self, reply: AttachReply, scenario: &[u8]) -> Result<(), TransportError> {
+        let mut sample = self
+            .replies
+            .loan_slice_uninit(scenario.len())
+            .map_err(|e| attach_failure(SERVICE_ATTACH_REPLY, &e))?;
+        *sample.user_header_mut() = reply;
+        sample.write_from_slice(scenario).send().map_err(|e| attach_failure(SERVICE_ATTACH_REPLY, &e))?;
+        Ok(())
+    }
+}
+
+/// A participant's side of attaching.
+#[derive(Debug)]
+pub struct AttachLine {
+    requests: Publisher<ipc::Service, AttachRequest, ()>,
+    replies: Subscriber<ipc::Service, [u8], AttachReply>,
+}
+
+/// A reply to somebody's request.
+#[derive(Debug)]
+pub struct ReplyFrame(Sample<ipc::Service, [u8], AttachReply>);
+
+impl ReplyFrame {
+    /// The reply.
+    pub fn reply(&self) -> &AttachReply {
+        self.0.user_header()
+    }
+
+    /// The encoded scenario.
+    pub fn scenario(&self) -> &[u8] {
+        self.0.payload()
+    }
+}
+
+impl AttachLine {
+    /// Sends a request.
+    pub fn request(&self, request: AttachRequest) -> Result<(), TransportError> {
+        self.requests.send_copy(request).map(|_| ()).map_err(|e| attach_failure(SERVICE_ATTACH, &e))
+    }
+
+    /// The next reply, if there is one; possibly to somebody else.
+    pub fn next_reply(&self) -> Result<Option<ReplyFrame>, TransportError> {
+        match self.replies.receive() {
+            Ok(sample) => Ok(sample.map(ReplyFrame)),
+            Err(e) => Err(attach_failure(SERVICE_ATTACH_REPLY, &e)),
+        }
+    }
+}
+
+fn attach_failure(service: &str, error: &dyn std::fmt::Debug) -> TransportError {
+    TransportError::Failed { service: service.to_owned(), reason: format!("{error:?}") }
+}
