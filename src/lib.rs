@@ -4,6 +4,7 @@
 pub mod control;
 pub mod coordination;
 pub mod lockstep;
+pub mod process;
 pub mod scenario;
 pub mod transport;
 pub mod vehicle;

@@ -1,0 +1,80 @@
+//! The coordinator and controller processes.
+
+use super::world::expected_vehicles;
+use super::{Attachment, Joining, Patience, ProcessError, StopFlag, Waiter};
+use crate::control::ControllerPool;
+use crate::coordination::Coordinator;
+use crate::lockstep::{ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity};
+use crate::scenario::share::{neighbour_coordinators, zones_of};
+use crate::transport::iox::{RunName, RunSpace};
+use ipc_schemas::{self as frames, AttachReply, Role};
+use std::time::Duration;
+
+/// Runs a coordinator process to the end of the run.
+pub fn run_coordinator(
+    run: &RunName,
+    joining: Joining,
+    peer_timeout: Duration,
+    stop: &StopFlag,
+) -> Result<(), ProcessError> {
+    let space = RunSpace::enter(run)?;
+    let attachment = Attachment::join(&space, run, joining, stop)?;
+    let AttachReply { index, coordinators, controllers, .. } = attachment.reply;
+    let scenario = &attachment.scenario;
+    let zones = scenario.network.zones.len() as u32;
+    let mask = neighbour_coordinators(&scenario.network, coordinators)[index as usize];
+    let own = |prefix: &str| format!("{prefix}{index}");
+    let neighbours = (0..coordinators)
+        .filter(|n| mask >> n & 1 == 1)
+        .map(|n| {
+            let service = space.open(&format!("{}{n}", frames::SERVICE_SUMMARY_PREFIX))?;
+            let owned = zones_of(zones, n, coordinators);
+            let expected = owned.len();
+            Ok((n as u16, owned, service.outbox(expected)?))
+        })
+        .collect::<Result<_, ProcessError>>()?;
+    let ports = CoordinatorPorts {
+        state: space.open(&own(frames::SERVICE_COORDINATOR_STATE_PREFIX))?.inbox()?,
+        summaries: space.open(&own(frames::SERVICE_SUMMARY_PREFIX))?.inbox()?,
+        neighbours,
+        // Two constraints per vehicle at most while zones only merge.
+        coordination: space.open(frames::SERVICE_COORDINATION)?.outbox(2 * expected_vehicles(scenario))?,
+    };
+    let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
+    let identity = identity(&attachment.reply, Role::Coordinator);
+    let mut driver = CoordinatorDriver::new(role, ports, identity, controllers);
+    attachment.ready(stop)?;
+    // Events may be far apart; what bounds this wait is the life of the world, not a time.
+    let patience = Patience::cold(Duration::MAX);
+    let _ = peer_timeout;
+    Waiter::new(patience, stop.clone(), attachment.world()).drive(|| driver.advance())
+}
+
+/// Runs a controller process with the built-in law to the end of the run.
+pub fn run_controller(
+    run: &RunName,
+    joining: Joining,
+    peer_timeout: Duration,
+    stop: &StopFlag,
+) -> Result<(), ProcessError> {
+    let space = RunSpace::enter(run)?;
+    let attachment = Attachment::join(&space, run, joining, stop)?;
+    let AttachReply { index, controllers, first_step, .. } = attachment.reply;
+    let scenario = &attachment.scenario;
+    let zones = scenario.network.zones.len() as u32;
+    let ports = ControllerPorts {
+        state: space.open(frames::SERVICE_STATE)?.inbox()?,
+        coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
+        command: space.open(frames::SERVICE_COMMAND)?.outbox(expected_vehicles(scenario))?,
+    };
+    let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, controllers));
+    let identity = identity(&attachment.reply, Role::Controller);
+    let mut driver = ControllerDriver::new(role, ports, identity, first_step);
+    attachment.ready(stop)?;
+    let patience = Patience::hot(peer_timeout);
+    Waiter::new(patience, stop.clone(), attachment.world()).drive(|| driver.advance())
+}
+
+fn identity(reply: &AttachReply, role: Role) -> Identity {
+    Identity { run_id: reply.run_id, role, index: reply.index as u16, generation: reply.generation }
+}
