@@ -226,3 +226,19 @@ fn slack_weight_goes_from_the_reference_to_the_rate() {
     // A row that the reference satisfies does nothing, however large the weight.
     assert_eq!(Tracking { u_ref_mps2: -3.0, ..with(1e9) }.free_minimum_mps2(), -3.0);
 }
+
+/// A plain program that makes Clarabel's full-length iteration cycle until its limit, 1.8 m/s^2 off.
+#[test]
+fn clarabel_is_retried_where_it_cycles() {
+    let tracking = Tracking { u_ref_mps2: 0.0, error_mps: 0.0, clf_rate_per_s: 0.1, slack_weight: 0.0 };
+    let program = Program {
+        limits: (-3.496254858824285, 1.7376054896745794),
+        at_least: vec![-1.8377795265163683],
+        at_most: vec![
+            Inequality { coefficient: 0.05, bound: 16.87976548189509 },
+            Inequality { coefficient: 0.05, bound: 0.6468465763520684 },
+        ],
+    };
+    let u = clarabel::solve(&tracking, &program.list()).expect("0 is feasible");
+    assert!(u.abs() <= 1e-6, "{u}");
+}
