@@ -235,11 +235,27 @@ proptest! {
     #[test]
     fn corrected_perturbation_equals_a_fresh_plan(p in problems(), w in 0.0..30.0f64) {
         let law = ReferenceLaw::Corrected;
-        let old = p.solve(law);
+        let old = p.solve_forward(law);
         let new = Problem { terminal: Terminal::Speed(w), ..p };
         let perturbed = new.perturb(law, &old, p.terminal).cost(p.beta);
-        let fresh = new.solve(law).cost(p.beta);
+        let fresh = new.solve_forward(law).cost(p.beta);
         prop_assert!((perturbed - fresh).abs() <= 1e-9 * fresh, "{p:?} -> {w}: {perturbed} for {fresh}");
+    }
+
+    /// The plan for driving is the cheapest one, unless that one overshoots the end and comes back.
+    #[test]
+    fn forward_plans_only_give_up_cost_to_avoid_reversing(p in problems()) {
+        let law = ReferenceLaw::Corrected;
+        let (best, forward) = (p.solve(law), p.solve_forward(law));
+        let least_speed = |o: Optimum| {
+            let plan = place(&p, o, 0.0, 0.0);
+            (0..=400).map(|i| plan.speed_mps(o.duration_s * f64::from(i) / 400.0)).fold(f64::MAX, f64::min)
+        };
+        prop_assert!(forward.cost(p.beta) >= best.cost(p.beta));
+        if forward != best {
+            prop_assert!(least_speed(best) < 0.0, "{p:?}: {best:?} could have been driven");
+            prop_assert!(forward.duration_s < best.duration_s);
+        }
     }
 
     /// A vehicle's plan is perturbed again and again on its way: errors must not pile up.
@@ -248,13 +264,13 @@ proptest! {
         p in problems(), ws in prop::collection::vec(terminals(), 1..12),
     ) {
         let law = ReferenceLaw::Corrected;
-        let (mut now, mut optimum) = (p, p.solve(law));
+        let (mut now, mut optimum) = (p, p.solve_forward(law));
         for terminal in ws {
             let next = Problem { terminal, ..p };
             optimum = next.perturb(law, &optimum, now.terminal);
             now = next;
         }
-        let (perturbed, fresh) = (optimum.cost(p.beta), now.solve(law).cost(p.beta));
+        let (perturbed, fresh) = (optimum.cost(p.beta), now.solve_forward(law).cost(p.beta));
         prop_assert!((perturbed - fresh).abs() <= 1e-9 * fresh, "{now:?}: {perturbed} for {fresh}");
     }
 
@@ -286,7 +302,7 @@ proptest! {
         let (free, speed) =
             (Problem { terminal: Terminal::Free, ..p }, Problem { terminal: Terminal::Speed(w), ..p });
         for law in LAWS {
-            let (of_free, of_speed) = (free.solve(law), speed.solve(law));
+            let (of_free, of_speed) = (free.solve_forward(law), speed.solve_forward(law));
             prop_assert_eq!(free.perturb(law, &of_speed, speed.terminal), of_free);
             prop_assert_eq!(speed.perturb(law, &of_free, free.terminal), of_speed);
         }

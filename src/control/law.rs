@@ -204,7 +204,7 @@ impl Law {
                 };
                 let optimum = match old {
                     Some(old) => problem.perturb(law, &old.optimum, old.terminal),
-                    None => problem.solve(law),
+                    None => problem.solve_forward(law),
                 };
                 Reference {
                     start_s: s.entry_time_s,
@@ -222,7 +222,7 @@ impl Law {
                     start_s: s.time_s,
                     origin_m: s.x_m,
                     v0_mps: s.v_mps,
-                    optimum: problem.solve(law),
+                    optimum: problem.solve_forward(law),
                     terminal: s.terminal,
                 }
             }

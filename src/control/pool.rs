@@ -291,7 +291,7 @@ fn command(state: &VehicleState, decision: &super::Decision, memory: &Memory) ->
 /// The memory a command frame carries (the inverse of what [`ControllerPool::command`] writes).
 pub fn memory_of(command: &VehicleCommand) -> Memory {
     let mode = if command.mode == frames::MODE_OCBF { Mode::Ocbf } else { Mode::Fe };
-    let plan = (command.plan_duration_s > 0.0).then(|| Reference {
+    let plan = (command.plan_duration_s > 0.0).then_some(Reference {
         start_s: command.plan_start_s,
         origin_m: command.plan_origin_m,
         v0_mps: command.plan_v0_mps,
