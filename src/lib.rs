@@ -1,6 +1,7 @@
 //! Control Zones: safe, optimal coordination of connected automated vehicles through networks of
 //! control zones, as a lockstep multi-process runtime.
 
+pub mod app;
 pub mod control;
 pub mod coordination;
 pub mod lockstep;

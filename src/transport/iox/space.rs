@@ -149,8 +149,9 @@ impl RunSpace {
     pub fn enter(run: &RunName) -> Result<RunSpace, SpaceError> {
         // Everything iceoryx2 reports comes back as an error value, which says it better.
         set_log_level(LogLevel::Fatal);
-        let base = base_directory()?;
+        let base = base_directory();
         let directory = base.join(run.to_string());
+        private_directory(&base)?;
         private_directory(&directory)?;
         let config = config(run, &directory)?;
         let node = NodeBuilder::new()
@@ -275,8 +276,9 @@ impl RunSpace {
     /// otherwise. Returns whether the space is now empty.
     pub fn sweep(run: &RunName) -> Result<bool, SpaceError> {
         set_log_level(LogLevel::Fatal);
-        let directory = base_directory()?.join(run.to_string());
+        let directory = base_directory().join(run.to_string());
         if !directory.exists() {
+            remove_base(&directory);
             return Ok(true);
         }
         let config = config(run, &directory)?;
@@ -315,11 +317,15 @@ fn sweep(config: &Config, run: &RunName, directory: &Path) -> bool {
         }
     }
     let _ = std::fs::remove_dir_all(directory);
+    remove_base(directory);
+    true
+}
+
+/// Removes the directory of all runs; fails, as it should, while another run has its own in it.
+fn remove_base(directory: &Path) {
     if let Some(base) = directory.parent() {
-        // Succeeds for the last run only, which is just what is wanted.
         let _ = std::fs::remove_dir(base);
     }
-    true
 }
 
 /// File-name prefix of a run's shared memory. The user id keeps users apart; the two separators keep a
@@ -329,13 +335,11 @@ fn prefix(run: &RunName) -> String {
 }
 
 /// The directory under which each run has its own: in the user's runtime directory where there is one.
-fn base_directory() -> Result<PathBuf, SpaceError> {
-    let base = match std::env::var_os("XDG_RUNTIME_DIR") {
+fn base_directory() -> PathBuf {
+    match std::env::var_os("XDG_RUNTIME_DIR") {
         Some(runtime) if Path::new(&runtime).is_dir() => PathBuf::from(runtime).join("cz"),
         _ => std::env::temp_dir().join(format!("cz-{}", rustix::process::getuid().as_raw())),
-    };
-    private_directory(&base)?;
-    Ok(base)
+    }
 }
 
 fn private_directory(path: &Path) -> Result<(), SpaceError> {

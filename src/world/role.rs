@@ -152,6 +152,11 @@ impl World {
         self.held_u_mps2.len() as u32
     }
 
+    /// Vehicles that have left the network so far.
+    pub fn departed(&self) -> u32 {
+        self.departed
+    }
+
     /// The number of records of the present state frame.
     pub fn record_count(&self) -> usize {
         let in_zones: usize = self.zones.iter().map(|z| z.cars.len() + usize::from(z.left.is_some())).sum();
