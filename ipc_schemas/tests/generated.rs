@@ -116,7 +116,7 @@ const GOLDEN: [Golden; 7] = [
     ),
     (
         "cz.AttachReply.v1",
-        64,
+        72,
         &[
             ("instance", "u64", 0),
             ("run_id", "u64", 8),
@@ -129,6 +129,8 @@ const GOLDEN: [Golden; 7] = [
             ("index", "u32", 52),
             ("coordinators", "u32", 56),
             ("controllers", "u32", 60),
+            ("waiting", "u32", 64),
+            ("reserved", "u32", 68),
         ],
     ),
 ];

@@ -1,5 +1,6 @@
 //! Command-line arguments.
 
+use crate::process::{Placement, WaitMode};
 use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
 use crate::scenario::{Override, Scenario, ScenarioError, load};
 use crate::transport::iox::RunName;
@@ -118,6 +119,9 @@ pub(super) struct WaitArgs {
     /// How long to wait for a frame before giving the run up, s.
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds)]
     pub peer_timeout: Duration,
+    /// Pin the processes to cores.
+    #[arg(long, value_enum, default_value_t = Placement::None)]
+    pub pin: Placement,
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {
@@ -144,6 +148,9 @@ pub(super) struct RunArgs {
     pub run: Option<RunName>,
     #[command(flatten)]
     pub wait: WaitArgs,
+    /// How the processes of the run wait for frames.
+    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
+    pub wait_mode: WaitMode,
 }
 
 #[derive(Debug, Args)]
@@ -160,6 +167,9 @@ pub(super) struct WorldArgs {
     pub json: Option<PathBuf>,
     #[command(flatten)]
     pub wait: WaitArgs,
+    /// How the processes of the run wait for frames.
+    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
+    pub wait_mode: WaitMode,
     /// Process id of the supervisor: report to it on stdout, and end with it.
     #[arg(long, hide = true, value_name = "PID")]
     pub supervised: Option<u32>,

@@ -44,7 +44,9 @@ impl From<ProcessError> for AppError {
     fn from(error: ProcessError) -> AppError {
         match error {
             ProcessError::Interrupted { .. } => AppError::Interrupted(error.to_string()),
-            ProcessError::AlreadyActive { .. } => AppError::Usage(error.to_string()),
+            ProcessError::AlreadyActive { .. } | ProcessError::TooFewCores { .. } => {
+                AppError::Usage(error.to_string())
+            }
             other => AppError::Failed(other.to_string()),
         }
     }

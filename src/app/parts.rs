@@ -4,11 +4,8 @@ use super::AppError;
 use super::args::{PartArgs, WorldArgs};
 use super::report::{Summary, Transport};
 use super::supervise::WorldLine;
-use crate::process::{
-    Joining, ProcessError, StopFlag, WorldOptions, run_controller, run_coordinator, run_world,
-};
+use crate::process::{Joining, StopFlag, WorldOptions, place, run_controller, run_coordinator, run_world};
 use crate::scenario::scenario_hash;
-use crate::transport::iox::RunName;
 use crate::world::World;
 use ipc_schemas::Role;
 use std::io::Write;
@@ -29,7 +26,9 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         controllers: args.share.ctrl_procs,
         attach_timeout: args.wait.attach_timeout,
         peer_timeout: args.wait.peer_timeout,
+        wait: args.wait_mode,
     };
+    place(args.wait.pin, Role::World, 0);
     if args.supervised.is_some() {
         let mut last = Instant::now();
         let outcome = run_world(&scenario, &options, &stop, |world| {
@@ -47,24 +46,22 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
 }
 
 pub(super) fn coordinator(args: &PartArgs) -> Result<(), AppError> {
-    part(args, Role::Coordinator, run_coordinator)
+    let (joining, stop) = prepare(args, Role::Coordinator)?;
+    Ok(run_coordinator(&args.run, joining, args.wait.pin, &stop)?)
 }
 
 pub(super) fn controller(args: &PartArgs) -> Result<(), AppError> {
-    part(args, Role::Controller, run_controller)
+    let (joining, stop) = prepare(args, Role::Controller)?;
+    Ok(run_controller(&args.run, joining, args.wait.peer_timeout, args.wait.pin, &stop)?)
 }
 
-fn part(
-    args: &PartArgs,
-    role: Role,
-    run: impl Fn(&RunName, Joining, Duration, &StopFlag) -> Result<(), ProcessError>,
-) -> Result<(), AppError> {
+fn prepare(args: &PartArgs, role: Role) -> Result<(Joining, StopFlag), AppError> {
     let scenario_hash =
         if args.scenario.is_given() { Some(scenario_hash(&args.scenario.load()?)) } else { None };
     let stop = StopFlag::from_signals()?;
     follow_supervisor(args.supervised)?;
     let joining = Joining { role, index: args.index, scenario_hash, timeout: args.wait.attach_timeout };
-    Ok(run(&args.run, joining, args.wait.peer_timeout, &stop)?)
+    Ok((joining, stop))
 }
 
 /// Has the kernel send SIGTERM when the supervisor dies, however it dies.

@@ -29,6 +29,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
             scenario: &args.scenario,
             share: args.share,
             wait: args.wait,
+            wait_mode: args.wait_mode,
         };
         (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
     };

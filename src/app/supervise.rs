@@ -3,9 +3,10 @@
 use super::AppError;
 use super::args::{ScenarioArgs, ShareArgs, WaitArgs};
 use super::run::Position;
-use crate::process::Outcome;
+use crate::process::{Outcome, WaitMode};
 use crate::transport::iox::{RunName, RunSpace};
 use crate::world::World;
+use clap::ValueEnum;
 use crossbeam::channel::{Receiver, Sender, select, unbounded};
 use rustix::process::{Pid, Signal, kill_process};
 use serde::{Deserialize, Serialize};
@@ -35,6 +36,7 @@ pub(super) struct Plan<'a> {
     pub scenario: &'a ScenarioArgs,
     pub share: ShareArgs,
     pub wait: WaitArgs,
+    pub wait_mode: WaitMode,
 }
 
 /// How long the others may take to end by themselves once one has failed, and once asked to.
@@ -97,10 +99,14 @@ impl Family {
         let mut common: Vec<String> = ["--run", &plan.run.to_string()].map(str::to_owned).to_vec();
         common.extend(["--attach-timeout".to_owned(), timeout(plan.wait.attach_timeout)]);
         common.extend(["--peer-timeout".to_owned(), timeout(plan.wait.peer_timeout)]);
+        let name =
+            |v: Option<clap::builder::PossibleValue>| v.map_or_else(String::new, |v| v.get_name().to_owned());
+        common.extend(["--pin".to_owned(), name(plan.wait.pin.to_possible_value())]);
         common.extend(["--supervised".to_owned(), std::process::id().to_string()]);
         let mut world = common.clone();
         world.extend(["--ctrl-procs".to_owned(), plan.share.ctrl_procs.to_string()]);
         world.extend(["--coord-procs".to_owned(), plan.share.coord_procs.to_string()]);
+        world.extend(["--wait".to_owned(), name(plan.wait_mode.to_possible_value())]);
         world.extend(plan.scenario.to_arguments());
         self.spawn("world".to_owned(), "world", world)?;
         for (role, command, count) in

@@ -1,7 +1,7 @@
 //! How participants join a run, on both sides.
 
 use super::peers::is_alive;
-use super::{Peer, Peers, ProcessError, StopFlag};
+use super::{Peer, Peers, ProcessError, StopFlag, WorldOptions};
 use crate::scenario::{Scenario, decode, scenario_hash};
 use crate::transport::TransportError;
 use crate::transport::iox::{AttachDesk, AttachLine, RunName, RunSpace, SpaceError};
@@ -164,6 +164,7 @@ pub(super) struct Reception {
     run_id: u64,
     scenario: Vec<u8>,
     scenario_hash: u64,
+    waiting: u32,
     coordinators: Vec<Option<Seat>>,
     controllers: Vec<Option<Seat>>,
 }
@@ -180,15 +181,16 @@ impl Reception {
         space: &RunSpace,
         scenario: &Scenario,
         run_id: u64,
-        coordinators: u32,
-        controllers: u32,
+        options: &WorldOptions,
     ) -> Result<Reception, SpaceError> {
+        let WorldOptions { coordinators, controllers, .. } = *options;
         let bytes = crate::scenario::encode(scenario);
         Ok(Reception {
             desk: space.create_attach_desk((coordinators + controllers) as usize, bytes.len())?,
             run_id,
             scenario_hash: scenario_hash(scenario),
             scenario: bytes,
+            waiting: options.wait.code(),
             coordinators: vec![None; coordinators as usize],
             controllers: vec![None; controllers as usize],
         })
@@ -210,6 +212,8 @@ impl Reception {
                 index,
                 coordinators: self.coordinators.len() as u32,
                 controllers: self.controllers.len() as u32,
+                waiting: self.waiting,
+                reserved: 0,
             };
             let scenario = if status == frames::ATTACH_ACCEPTED { &self.scenario[..] } else { &[] };
             self.desk.reply(reply, scenario)?;

@@ -3,6 +3,7 @@
 mod attach;
 mod participant;
 mod peers;
+mod placement;
 mod stop;
 mod wait;
 mod world;
@@ -10,8 +11,9 @@ mod world;
 pub use attach::{Attachment, Joining};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
+pub use placement::{Placement, place};
 pub use stop::StopFlag;
-pub use wait::{Patience, Waiter};
+pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{LatencyUs, Outcome, WorldOptions, run_in_process, run_world};
 
 use crate::lockstep::{Awaited, LockstepError};
@@ -72,6 +74,16 @@ pub enum ProcessError {
         command: &'static str,
         /// How long was waited.
         seconds: f64,
+    },
+    /// There are more processes than cores to spin on.
+    #[error(
+        "waiting by spinning needs a core for each of the {processes} processes, and there are {cores}; use --wait hybrid"
+    )]
+    TooFewCores {
+        /// Processes of the run.
+        processes: usize,
+        /// Cores this process may use.
+        cores: usize,
     },
     /// A frame did not come in time.
     #[error("waited {seconds} s for {awaited}")]

@@ -1,12 +1,12 @@
 //! The world process.
 
 use super::attach::Reception;
-use super::{Patience, ProcessError, StopFlag, Waiter};
+use super::{Patience, ProcessError, StopFlag, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Progress, WorldDriver, WorldPorts};
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
-use crate::transport::iox::{RunName, RunSpace, Service, ServiceLimits, SpaceError};
+use crate::transport::iox::{BellRope, BellService, RunName, RunSpace, Service, ServiceLimits, SpaceError};
 use crate::world::{World, WorldSummary};
 use hdrhistogram::Histogram;
 use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
@@ -27,6 +27,8 @@ pub struct WorldOptions {
     pub attach_timeout: Duration,
     /// How long to wait for a frame.
     pub peer_timeout: Duration,
+    /// How the processes of the run wait.
+    pub wait: WaitMode,
 }
 
 /// Percentiles of the time a step takes, from the state's publication to the end of integration, us.
@@ -100,7 +102,12 @@ pub fn run_world(
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
-    let WorldOptions { coordinators, controllers, .. } = *options;
+    let WorldOptions { coordinators, controllers, wait, .. } = *options;
+    let processes = 1 + (coordinators + controllers) as usize;
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    if wait == WaitMode::Spin && processes > cores {
+        return Err(ProcessError::TooFewCores { processes, cores });
+    }
     let space = RunSpace::enter(&options.run)?;
     let mut run_id = [0u8; 8];
     if rustix::rand::getrandom(&mut run_id, rustix::rand::GetRandomFlags::NONBLOCK).is_err() {
@@ -113,14 +120,17 @@ pub fn run_world(
     };
     // The desk last: once it exists, everything else does.
     let services = Services::create(&space, scenario, coordinators, controllers).map_err(active)?;
-    let ports = services.world_ports(scenario)?;
-    let mut reception =
-        Reception::open(&space, scenario, run_id, coordinators, controllers).map_err(active)?;
+    let _bells = create_bells(&space, wait, coordinators, controllers)?;
+    let bell = wait.has_bell(Role::World).then(|| space.bell(frames::BELL_WORLD)).flatten();
+    let mut reception = Reception::open(&space, scenario, run_id, options).map_err(active)?;
     receive_all(&mut reception, options, stop)?;
+    // Bells are hung up by now, so that the ropes hold.
+    let ports = services.world_ports(&space, scenario, wait)?;
 
     let world = World::new(scenario.clone(), coordinators);
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
-    let mut waiter = Waiter::new(Patience::hot(options.peer_timeout), stop.clone(), reception.peers());
+    let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
+    let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
     let mut meter = StepMeter::start();
     let mut step = 0;
     loop {
@@ -200,6 +210,7 @@ struct Services {
     command: Service<VehicleCommand>,
     _coordination: Service<Assignment>,
     _summaries: Vec<Service<ZoneSummary>>,
+    controllers: u32,
 }
 
 impl Services {
@@ -213,6 +224,7 @@ impl Services {
         let limits = |publishers, subscribers| ServiceLimits { publishers, subscribers, nodes: 1 + m + n };
         let masks = neighbour_coordinators(&scenario.network, coordinators);
         Ok(Services {
+            controllers,
             state: space.create(frames::SERVICE_STATE, limits(1, n))?,
             coordinator_states: (0..m)
                 .map(|i| {
@@ -234,7 +246,9 @@ impl Services {
     #[allow(clippy::type_complexity)] // the port types are named nowhere else
     fn world_ports(
         &self,
+        space: &RunSpace,
         scenario: &Scenario,
+        wait: WaitMode,
     ) -> Result<
         WorldPorts<
             crate::transport::iox::IoxOutbox<VehicleState>,
@@ -245,15 +259,53 @@ impl Services {
     > {
         let expected = expected_vehicles(scenario);
         Ok(WorldPorts {
-            state: self.state.outbox(expected)?,
+            state: self.state.outbox(expected)?.ringing(controller_ropes(space, wait, self.controllers)),
             coordinator_states: self
                 .coordinator_states
                 .iter()
-                .map(|s| s.outbox(expected))
-                .collect::<Result<_, _>>()?,
+                .zip(0..)
+                .map(|(s, i)| Ok(s.outbox(expected)?.ringing(coordinator_rope(space, wait, i))))
+                .collect::<Result<_, SpaceError>>()?,
             command: self.command.inbox()?,
         })
     }
+}
+
+/// Creates the bells of all who sleep under this mode.
+fn create_bells(
+    space: &RunSpace,
+    wait: WaitMode,
+    coordinators: u32,
+    controllers: u32,
+) -> Result<Vec<BellService>, SpaceError> {
+    let (m, n) = (coordinators as usize, controllers as usize);
+    let mut bells = Vec::new();
+    if wait.has_bell(Role::World) {
+        bells.push(space.create_bell(frames::BELL_WORLD, n)?);
+    }
+    if wait.has_bell(Role::Coordinator) {
+        for i in 0..coordinators {
+            bells.push(space.create_bell(&format!("{}{i}", frames::BELL_COORDINATOR_PREFIX), m)?);
+        }
+    }
+    if wait.has_bell(Role::Controller) {
+        for i in 0..controllers {
+            bells.push(space.create_bell(&format!("{}{i}", frames::BELL_CONTROLLER_PREFIX), 1 + m)?);
+        }
+    }
+    Ok(bells)
+}
+
+/// The ropes of all controllers' bells, when they have any.
+pub(super) fn controller_ropes(space: &RunSpace, wait: WaitMode, controllers: u32) -> Vec<BellRope> {
+    let count = if wait.has_bell(Role::Controller) { controllers } else { 0 };
+    (0..count).filter_map(|i| space.bell_rope(&format!("{}{i}", frames::BELL_CONTROLLER_PREFIX))).collect()
+}
+
+/// The rope of a coordinator's bell, when it has one.
+pub(super) fn coordinator_rope(space: &RunSpace, wait: WaitMode, index: u32) -> Option<BellRope> {
+    let rope = || space.bell_rope(&format!("{}{index}", frames::BELL_COORDINATOR_PREFIX));
+    wait.has_bell(Role::Coordinator).then(rope).flatten()
 }
 
 /// About as many vehicles as the network holds in dense but moving traffic. Frames may be longer; this

@@ -82,7 +82,7 @@ pub enum SpaceError {
     },
 }
 
-fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
+pub(super) fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
     SpaceError::Failed { what: what.to_owned(), reason: format!("{reason:?}") }
 }
 
@@ -163,7 +163,7 @@ impl RunSpace {
         Ok(RunSpace { node: Some(node), config, run: run.clone(), directory })
     }
 
-    fn node(&self) -> &Node<ipc::Service> {
+    pub(super) fn node(&self) -> &Node<ipc::Service> {
         self.node.as_ref().expect("the node is only taken when the space is dropped")
     }
 
@@ -368,7 +368,7 @@ fn config(run: &RunName, directory: &Path) -> Result<Config, SpaceError> {
     Ok(config)
 }
 
-fn service_name(name: &str) -> Result<ServiceName, SpaceError> {
+pub(super) fn service_name(name: &str) -> Result<ServiceName, SpaceError> {
     ServiceName::new(name).map_err(|e| failed(&format!("form the service name {name}"), &e))
 }
 
