@@ -111,7 +111,8 @@
 
 /** World -> controllers: `cz_vehicle_state_t` of every step. */
 #define CZ_SERVICE_STATE "cz/state"
-/** World -> coordinator `i`: `cz_vehicle_state_t`, only of the steps it acts in; `i` is appended. */
+/** World -> coordinator `i`: `cz_vehicle_state_t`, only of the steps it acts in and only of its
+ *  zones that act; `i` is appended. */
 #define CZ_SERVICE_COORDINATOR_STATE_PREFIX "cz/coordinator-state/"
 /** Coordinators -> controllers: `cz_assignment_t` of the steps they act in. */
 #define CZ_SERVICE_COORDINATION "cz/coordination"

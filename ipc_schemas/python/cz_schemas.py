@@ -88,7 +88,8 @@ ATTACH_BAD_ROLE = 4
 
 #: World → controllers: `VehicleState` of every step.
 SERVICE_STATE = "cz/state"
-#: World → coordinator `i`: `VehicleState`, only of the steps it acts in; `i` is appended.
+#: World → coordinator `i`: `VehicleState`, only of the steps it acts in and only of its zones that
+#: act; `i` is appended.
 SERVICE_COORDINATOR_STATE_PREFIX = "cz/coordinator-state/"
 #: Coordinators → controllers: `Assignment` of the steps they act in.
 SERVICE_COORDINATION = "cz/coordination"

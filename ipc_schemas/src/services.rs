@@ -5,8 +5,8 @@ use crate::code::codes;
 codes! {
     /// World → controllers: [`VehicleState`](crate::VehicleState) of every step.
     pub const SERVICE_STATE: &str = "cz/state";
-    /// World → coordinator `i`: [`VehicleState`](crate::VehicleState), only of the steps it acts in; `i`
-    /// is appended.
+    /// World → coordinator `i`: [`VehicleState`](crate::VehicleState), only of the steps it acts in and
+    /// only of its zones that act; `i` is appended.
     pub const SERVICE_COORDINATOR_STATE_PREFIX: &str = "cz/coordinator-state/";
     /// Coordinators → controllers: [`Assignment`](crate::Assignment) of the steps they act in.
     pub const SERVICE_COORDINATION: &str = "cz/coordination";

@@ -144,7 +144,7 @@ pub(super) struct RunArgs {
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,
     /// Name of the run; runs of different names do not see each other [default: one of its own].
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", conflicts_with = "in_process")]
     pub run: Option<RunName>,
     #[command(flatten)]
     pub wait: WaitArgs,

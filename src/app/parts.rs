@@ -47,7 +47,7 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
 
 pub(super) fn coordinator(args: &PartArgs) -> Result<(), AppError> {
     let (joining, stop) = prepare(args, Role::Coordinator)?;
-    Ok(run_coordinator(&args.run, joining, args.wait.pin, &stop)?)
+    Ok(run_coordinator(&args.run, joining, args.wait.peer_timeout, args.wait.pin, &stop)?)
 }
 
 pub(super) fn controller(args: &PartArgs) -> Result<(), AppError> {

@@ -4,7 +4,7 @@ use super::AppError;
 use super::args::RunArgs;
 use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
-use crate::process::{StopFlag, run_in_process};
+use crate::process::{StopFlag, WaitMode, check_cores, run_in_process};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::World;
@@ -14,6 +14,9 @@ use std::sync::Arc;
 pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
     let scenario = Arc::new(args.scenario.load()?);
     args.share.check(&scenario)?;
+    if args.wait_mode == WaitMode::Spin && !args.in_process {
+        check_cores(1 + (args.share.coord_procs + args.share.ctrl_procs) as usize)?;
+    }
     let bar = Bar::new(&scenario);
     let (transport, outcome) = if args.in_process {
         let stop = StopFlag::from_signals()?;

@@ -85,16 +85,18 @@ where
             flags: if finished { FLAG_END_OF_RUN } else { 0 },
             ..self.identity.header(step, self.world.time_ns())
         };
-        let count = self.world.record_count();
         // Coordinators first: theirs is the longer way.
         for (index, outbox) in self.ports.coordinator_states.iter_mut().enumerate() {
             if finished || masks.acting >> index & 1 == 1 {
-                let world = &self.world;
-                let loan = outbox.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
+                let (world, index) = (&self.world, index as u32);
+                let loan = outbox.loan(header, world.coordinator_record_count(index), |slots| {
+                    world.coordinator_records(index).for_each(|r| slots.push(r));
+                })?;
                 check_reached("a coordinator's state frame", step, loan.send()?, 1, finished)?;
             }
         }
         let world = &self.world;
+        let count = world.record_count();
         let loan =
             self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
         self.world.seal(loan.records());

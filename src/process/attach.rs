@@ -234,7 +234,7 @@ impl Reception {
             _ => return (frames::ATTACH_BAD_ROLE, 0),
         };
         let own = seats.iter().position(|s| s.is_some_and(|s| s.instance == request.instance));
-        let free = |seat: &Option<Seat>| seat.is_none_or(|s| !s.ready && !is_alive(s.process_id));
+        let free = |seat: &Option<Seat>| seat.is_none_or(|s| !is_alive(s.process_id));
         let place = own.or_else(|| match request.wanted_index {
             frames::ANY_INDEX => seats.iter().position(free),
             wanted => {
@@ -252,9 +252,10 @@ impl Reception {
         (frames::ATTACH_ACCEPTED, place as u32)
     }
 
-    /// The first participant that is not ready: its role and index.
+    /// The first participant that is not ready, or died since: its role and index.
     pub(super) fn first_missing(&self) -> Option<(Role, usize)> {
-        let missing = |seats: &[Option<Seat>]| seats.iter().position(|s| !s.is_some_and(|s| s.ready));
+        let there = |seat: &Seat| seat.ready && is_alive(seat.process_id);
+        let missing = |seats: &[Option<Seat>]| seats.iter().position(|s| !s.as_ref().is_some_and(there));
         missing(&self.coordinators)
             .map(|i| (Role::Coordinator, i))
             .or_else(|| missing(&self.controllers).map(|i| (Role::Controller, i)))

@@ -14,7 +14,7 @@ pub use peers::{Peer, Peers};
 pub use placement::{Placement, place};
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
-pub use world::{LatencyUs, Outcome, WorldOptions, run_in_process, run_world};
+pub use world::{LatencyUs, Outcome, WorldOptions, check_cores, run_in_process, run_world};
 
 use crate::lockstep::{Awaited, LockstepError};
 use crate::scenario::DecodeError;

@@ -10,10 +10,15 @@ use crate::transport::iox::{RunName, RunSpace};
 use ipc_schemas::{self as frames, AttachReply, Role};
 use std::time::Duration;
 
+/// How long a coordinator waits for the next event. Events may be far apart in a paced run; a world that
+/// dies is noticed at once, and this bounds the wait for one that hangs.
+const BETWEEN_EVENTS: Duration = Duration::from_secs(3600);
+
 /// Runs a coordinator process to the end of the run.
 pub fn run_coordinator(
     run: &RunName,
     joining: Joining,
+    peer_timeout: Duration,
     placement: Placement,
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
@@ -50,9 +55,8 @@ pub fn run_coordinator(
     let identity = identity(&attachment.reply, Role::Coordinator);
     let mut driver = CoordinatorDriver::new(role, ports, identity, controllers);
     attachment.ready(stop)?;
-    // Events may be far apart; what bounds this wait is the life of the world, not a time.
     let hot_processes = 1 + controllers as usize;
-    let patience = Patience::of(wait, Role::Coordinator, hot_processes, Duration::MAX);
+    let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
     Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world()).drive(|| driver.advance())
 }
 

@@ -95,6 +95,12 @@ impl StepMeter {
     }
 }
 
+/// Refuses to spin with more processes than cores.
+pub fn check_cores(processes: usize) -> Result<(), ProcessError> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    if processes > cores { Err(ProcessError::TooFewCores { processes, cores }) } else { Ok(()) }
+}
+
 /// Runs the world of a multi-process run to its end; `progress` is called now and then.
 pub fn run_world(
     scenario: &Arc<Scenario>,
@@ -103,10 +109,8 @@ pub fn run_world(
     mut progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
     let WorldOptions { coordinators, controllers, wait, .. } = *options;
-    let processes = 1 + (coordinators + controllers) as usize;
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    if wait == WaitMode::Spin && processes > cores {
-        return Err(ProcessError::TooFewCores { processes, cores });
+    if wait == WaitMode::Spin {
+        check_cores(1 + (coordinators + controllers) as usize)?;
     }
     let space = RunSpace::enter(&options.run)?;
     let mut run_id = [0u8; 8];

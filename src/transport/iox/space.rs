@@ -310,7 +310,7 @@ fn sweep(config: &Config, run: &RunName, directory: &Path) -> bool {
     if alive || listed.is_err() {
         return false;
     }
-    let prefix = prefix(run);
+    let prefix = prefix(run, directory);
     for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
         if entry.file_name().to_string_lossy().starts_with(&prefix) {
             let _ = std::fs::remove_file(entry.path());
@@ -328,10 +328,12 @@ fn remove_base(directory: &Path) {
     }
 }
 
-/// File-name prefix of a run's shared memory. The user id keeps users apart; the two separators keep a
-/// run `a` from matching the files of a run `a-b`.
-fn prefix(run: &RunName) -> String {
-    format!("cz_{}_{run}__", rustix::process::getuid().as_raw())
+/// File-name prefix of a run's shared memory. The directory's hash in it keeps apart runs of one name in
+/// different runtime directories, which do not see each other's nodes and would otherwise sweep each
+/// other's memory; the fixed length of the hash keeps a run `a` from matching the files of a run `a-b`.
+fn prefix(run: &RunName, directory: &Path) -> String {
+    let place = xxhash_rust::xxh3::xxh3_64(directory.as_os_str().as_encoded_bytes()) as u32;
+    format!("cz_{}_{run}_{place:08x}_", rustix::process::getuid().as_raw())
 }
 
 /// The directory under which each run has its own: in the user's runtime directory where there is one.
@@ -363,7 +365,7 @@ fn config(run: &RunName, directory: &Path) -> Result<Config, SpaceError> {
     let path = iceoryx2::prelude::Path::new(path.as_bytes())
         .map_err(|e| failed(&format!("use the directory {path}"), &e))?;
     config.global.set_root_path(&path);
-    config.global.prefix = iceoryx2::prelude::FileName::new(prefix(run).as_bytes())
+    config.global.prefix = iceoryx2::prelude::FileName::new(prefix(run, directory).as_bytes())
         .map_err(|e| failed("form a file-name prefix", &e))?;
     Ok(config)
 }
