@@ -2,8 +2,10 @@
 //! control zones, as a lockstep multi-process runtime.
 
 pub mod app;
+pub mod bench;
 pub mod control;
 pub mod coordination;
+pub mod encoding;
 pub mod lockstep;
 pub mod process;
 pub mod scenario;

@@ -31,6 +31,61 @@ pub(super) enum Command {
     Ctrl(PartArgs),
     /// Compute one reference trajectory: duration, coefficients, cost.
     Plan(PlanArgs),
+    /// Measure latency, the solver, or scale on this machine.
+    Bench(BenchArgs),
+}
+
+#[derive(Debug, Args)]
+pub(super) struct BenchArgs {
+    #[command(subcommand)]
+    pub kind: BenchKind,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum BenchKind {
+    /// One step, next to the machine's floor and to what one would write instead.
+    Latency(MeasureArgs),
+    /// The closed-form QP next to Clarabel, and the whole controller.
+    Solver(MeasureArgs),
+    /// Step time from a hundred to a hundred thousand vehicles.
+    Scale(MeasureArgs),
+    /// The other process of a measurement.
+    #[command(hide = true)]
+    Peer(PeerArgs),
+}
+
+#[derive(Debug, Args)]
+pub(super) struct MeasureArgs {
+    /// Fewer repetitions, smaller sizes: a check that it works rather than a measurement.
+    #[arg(long)]
+    pub quick: bool,
+    /// Also write the results as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct PeerArgs {
+    #[command(flatten)]
+    pub scenario: PeerScenarioArgs,
+    pub kind: String,
+    pub values: Vec<String>,
+}
+
+/// The scenario of a measurement's other process: always the default one, changed.
+#[derive(Debug, Args)]
+pub(super) struct PeerScenarioArgs {
+    #[arg(long)]
+    pub seed: Option<u64>,
+    #[arg(long = "set")]
+    pub set: Vec<String>,
+}
+
+impl PeerScenarioArgs {
+    pub fn load(&self) -> Result<Scenario, ScenarioError> {
+        let (seed, set) = (self.seed, self.set.clone());
+        ScenarioArgs { scenario: None, seed, set, corridors: None }.load()
+    }
 }
 
 /// A program of its own around the arguments of a subcommand.
@@ -53,28 +108,44 @@ pub(super) struct ScenarioArgs {
     /// Change a scenario key, e.g. `--set zones.merge-1.flow.gain_mps=0.3`; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
+    /// A generated network that holds about this many vehicles at once.
+    #[arg(long, hide = true, value_name = "VEHICLES")]
+    pub corridors: Option<usize>,
 }
+
+/// Simulated time of a generated network's run, s: filling up, then thirty seconds to measure.
+const CORRIDORS_UNTIL_S: f64 = 90.0;
 
 impl ScenarioArgs {
     /// Loads and validates the scenario.
     pub fn load(&self) -> Result<Scenario, ScenarioError> {
+        if let Some(vehicles) = self.corridors {
+            return crate::bench::corridors(vehicles, CORRIDORS_UNTIL_S);
+        }
         let overrides = self.set.iter().map(|s| s.parse()).collect::<Result<Vec<Override>, _>>()?;
         load(self.scenario.as_deref(), &overrides, self.seed)
     }
 
-    /// Whether the command line says anything about the scenario.
-    pub fn is_given(&self) -> bool {
-        self.scenario.is_some() || self.seed.is_some() || !self.set.is_empty()
-    }
-
-    /// The arguments again, for a child process.
-    pub fn to_arguments(&self) -> Vec<String> {
+    /// The flags again, without the scenario itself.
+    pub fn to_flags(&self) -> Vec<String> {
         let mut arguments: Vec<String> = Vec::new();
         if let Some(seed) = self.seed {
             arguments.extend(["--seed".to_owned(), seed.to_string()]);
         }
-        for set in &self.set {
-            arguments.push(format!("--set={set}"));
+        arguments.extend(self.set.iter().map(|set| format!("--set={set}")));
+        arguments
+    }
+
+    /// Whether the command line says anything about the scenario.
+    pub fn is_given(&self) -> bool {
+        self.scenario.is_some() || self.seed.is_some() || !self.set.is_empty() || self.corridors.is_some()
+    }
+
+    /// The arguments again, for a child process.
+    pub fn to_arguments(&self) -> Vec<String> {
+        let mut arguments = self.to_flags();
+        if let Some(vehicles) = self.corridors {
+            arguments.extend(["--corridors".to_owned(), vehicles.to_string()]);
         }
         if let Some(scenario) = &self.scenario {
             arguments.extend(["--".to_owned(), scenario.clone()]);

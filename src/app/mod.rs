@@ -1,6 +1,7 @@
 //! The command line: what the four programs have in common, and what they print.
 
 mod args;
+mod bench;
 mod parts;
 mod plan;
 mod report;
@@ -63,6 +64,7 @@ pub fn cz() -> ExitCode {
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
             args::Command::Plan(args) => plan::plan(&args),
+            args::Command::Bench(args) => bench::bench(&args),
         },
     )
 }

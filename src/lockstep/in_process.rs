@@ -97,6 +97,11 @@ impl InProcess {
         self.world.world()
     }
 
+    /// Whether a coordinator acted in the last step.
+    pub fn was_event(&self) -> bool {
+        self.world.was_event()
+    }
+
     /// Runs one step; `false` once the run is over.
     ///
     /// # Panics

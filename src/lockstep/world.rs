@@ -26,6 +26,7 @@ pub struct WorldDriver<S, C, M> {
     /// Generation of each controller process.
     controller_generations: Vec<u32>,
     phase: Phase,
+    was_event: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -55,12 +56,18 @@ where
             controllers,
             controller_generations: vec![0; controllers as usize],
             phase: Phase::Publish,
+            was_event: false,
         }
     }
 
     /// The world as it stands.
     pub fn world(&self) -> &World {
         &self.world
+    }
+
+    /// Whether a coordinator acted in the step published last.
+    pub fn was_event(&self) -> bool {
+        self.was_event
     }
 
     /// Does what can be done now.
@@ -78,6 +85,7 @@ where
     fn publish(&mut self) -> Result<(), LockstepError> {
         let finished = self.world.is_finished();
         let masks = self.world.coordinator_masks();
+        self.was_event = masks.acting != 0;
         let step = self.world.step();
         let header = FrameHeader {
             coordinators_acting: masks.acting,

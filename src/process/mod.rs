@@ -11,10 +11,12 @@ mod world;
 pub use attach::{Attachment, Joining};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
-pub use placement::{Placement, place};
+pub use placement::{Affinity, Placement, place, unplaced};
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
-pub use world::{LatencyUs, Outcome, WorldOptions, check_cores, run_in_process, run_world};
+pub use world::{
+    LatencyUs, Outcome, Percentiles, WorldOptions, check_cores, new_histogram, run_in_process, run_world,
+};
 
 use crate::lockstep::{Awaited, LockstepError};
 use crate::scenario::DecodeError;

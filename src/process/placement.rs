@@ -14,7 +14,30 @@ pub enum Placement {
     Auto,
 }
 
-/// Pins the calling process by its role; returns its core, or `None` when it was left where it is.
+/// Runs `spawn` with the affinity the calling thread had before it was placed, which a child inherits.
+pub fn unplaced<T>(original: Option<&Affinity>, spawn: impl FnOnce() -> T) -> T {
+    let Some(Affinity(original)) = original else { return spawn() };
+    let placed = sched_getaffinity(None);
+    let _ = sched_setaffinity(None, original);
+    let result = spawn();
+    if let Ok(placed) = placed {
+        let _ = sched_setaffinity(None, &placed);
+    }
+    result
+}
+
+/// The cores a thread may use.
+#[derive(Debug)]
+pub struct Affinity(CpuSet);
+
+impl Affinity {
+    /// Of the calling thread.
+    pub fn current() -> Option<Affinity> {
+        sched_getaffinity(None).ok().map(Affinity)
+    }
+}
+
+/// Pins the calling thread, and what it starts from then on, by its role; returns its core, or `None` when it was left where it is.
 pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     if placement == Placement::None {
         return None;

@@ -53,7 +53,61 @@ pub struct Outcome {
     pub wall_s: f64,
     /// Step latency.
     pub step_latency_us: LatencyUs,
+    /// Latency of steps in which no coordinator acted, after a warm-up.
+    pub steady_ns: Percentiles,
+    /// Latency of steps in which one did, after a warm-up.
+    pub event_ns: Percentiles,
+    /// Peak resident memory of the process, bytes (0 where it cannot be known).
+    pub peak_rss_bytes: u64,
 }
+
+/// Peak resident memory of this process, bytes.
+fn peak_rss_bytes() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let kib =
+        status.lines().find_map(|l| l.strip_prefix("VmHWM:")?.trim().strip_suffix("kB")?.trim().parse().ok());
+    kib.map_or(0, |kib: u64| kib * 1024)
+}
+
+/// Percentiles of a measured time, ns.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Percentiles {
+    /// Median.
+    pub p50: u64,
+    /// 90th percentile.
+    pub p90: u64,
+    /// 99th percentile.
+    pub p99: u64,
+    /// 99.9th percentile.
+    pub p999: u64,
+    /// Greatest.
+    pub max: u64,
+    /// Number of measurements.
+    pub count: u64,
+}
+
+impl Percentiles {
+    /// Of a histogram.
+    pub fn of(histogram: &Histogram<u64>) -> Percentiles {
+        let at = |quantile| histogram.value_at_quantile(quantile);
+        Percentiles {
+            p50: at(0.5),
+            p90: at(0.9),
+            p99: at(0.99),
+            p999: at(0.999),
+            max: histogram.max(),
+            count: histogram.len(),
+        }
+    }
+}
+
+/// An empty latency histogram of three significant digits that grows as needed.
+pub fn new_histogram() -> Histogram<u64> {
+    Histogram::new(3).expect("three significant digits are valid")
+}
+
+/// Steps before the steady and event latencies are recorded: memory is mapped and caches fill.
+const WARM_UP_STEPS: u64 = 500;
 
 /// Steps between two looks at the signal flag and the clock for progress.
 const STEPS_PER_LOOK: u64 = 64;
@@ -62,6 +116,8 @@ const STEPS_PER_LOOK: u64 = 64;
 #[derive(Debug)]
 struct StepMeter {
     latency_ns: Histogram<u64>,
+    steady_ns: Histogram<u64>,
+    event_ns: Histogram<u64>,
     start: Instant,
     step_start: Instant,
 }
@@ -69,14 +125,23 @@ struct StepMeter {
 impl StepMeter {
     fn start() -> StepMeter {
         let now = Instant::now();
-        let latency_ns = Histogram::new(3).expect("three significant digits are valid");
-        StepMeter { latency_ns, start: now, step_start: now }
+        StepMeter {
+            latency_ns: new_histogram(),
+            steady_ns: new_histogram(),
+            event_ns: new_histogram(),
+            start: now,
+            step_start: now,
+        }
     }
 
-    fn step_done(&mut self) {
+    fn step_done(&mut self, was_event: bool) {
         let now = Instant::now();
-        // The histogram resizes itself; only an absurd latency could not be recorded.
-        let _ = self.latency_ns.record((now - self.step_start).as_nanos() as u64);
+        let ns = (now - self.step_start).as_nanos() as u64;
+        // The histograms resize themselves; only an absurd latency could not be recorded.
+        let _ = self.latency_ns.record(ns);
+        if self.latency_ns.len() > WARM_UP_STEPS {
+            let _ = if was_event { &mut self.event_ns } else { &mut self.steady_ns }.record(ns);
+        }
         self.step_start = now;
     }
 
@@ -91,6 +156,9 @@ impl StepMeter {
                 p999: us(self.latency_ns.value_at_quantile(0.999)),
                 max: us(self.latency_ns.max()),
             },
+            steady_ns: Percentiles::of(&self.steady_ns),
+            event_ns: Percentiles::of(&self.event_ns),
+            peak_rss_bytes: peak_rss_bytes(),
         }
     }
 }
@@ -145,7 +213,7 @@ pub fn run_world(
                 waiter.reset();
                 if driver.world().step() != step {
                     step = driver.world().step();
-                    meter.step_done();
+                    meter.step_done(driver.was_event());
                     if step.is_multiple_of(STEPS_PER_LOOK) {
                         progress(driver.world());
                         if stop.is_set() {
@@ -169,7 +237,7 @@ pub fn run_in_process(
     let mut run = InProcess::new(scenario, coordinators, controllers);
     let mut meter = StepMeter::start();
     while run.step()? {
-        meter.step_done();
+        meter.step_done(run.was_event());
         let step = run.world().step();
         if step.is_multiple_of(STEPS_PER_LOOK) {
             progress(run.world());

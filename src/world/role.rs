@@ -196,10 +196,8 @@ impl World {
     /// The records of the present state frame (see [`VehicleState`] for their order).
     pub fn records(&self) -> impl Iterator<Item = VehicleState> + '_ {
         let in_zones = (0..self.zones.len()).flat_map(|z| self.zone_records(z));
-        let on_links = self
-            .links
-            .iter()
-            .flat_map(|link| link.cars.iter().map(|c| self.record(c, frames::NO_ZONE, 0)));
+        let on_links =
+            self.links.iter().flat_map(|link| link.cars.iter().map(|c| self.record(c, frames::NO_ZONE, 0)));
         in_zones.chain(on_links)
     }
 
@@ -210,9 +208,10 @@ impl World {
             let now = if l.left_now { frames::STATE_LEFT_NOW } else { 0 };
             self.record(&l.car, zone as u32, frames::STATE_LEFT | now)
         });
-        let members = traffic.cars.iter().map(move |c| {
-            self.record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 })
-        });
+        let members = traffic
+            .cars
+            .iter()
+            .map(move |c| self.record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 }));
         left.chain(members)
     }
 
@@ -254,7 +253,8 @@ impl World {
             marks.event = traffic.has_event();
         }
         for zone in 0..self.marks.len() {
-            let told = self.scenario.network.neighbours(zone as u32).any(|n| self.marks[n as usize].event_before);
+            let told =
+                self.scenario.network.neighbours(zone as u32).any(|n| self.marks[n as usize].event_before);
             self.marks[zone].acts = self.marks[zone].event || told;
         }
         let mut events = 0u64;
