@@ -7,7 +7,9 @@ use super::socket::{Connection, Stream};
 use super::{BenchError, io};
 use crate::coordination::Coordinator;
 use crate::lockstep::{CoordinatorDriver, CoordinatorPorts, Identity, Progress, WorldDriver, WorldPorts};
-use crate::process::{Outcome, Percentiles, Placement, StopFlag, new_histogram, place, run_in_process};
+use crate::process::{
+    Affinity, Outcome, Percentiles, Placement, StopFlag, new_histogram, place, run_in_process, unplaced,
+};
 use crate::scenario::Scenario;
 use crate::transport::iox::{RunName, RunSpace, ServiceLimits};
 use crate::transport::memory::{MemoryInbox, MemoryService};
