@@ -3,7 +3,7 @@
 use super::AppError;
 use super::args::{ScenarioArgs, ShareArgs, WaitArgs};
 use super::run::Position;
-use crate::process::{Outcome, WaitMode};
+use crate::process::{Outcome, ProcessError, WaitMode};
 use crate::transport::iox::{RunName, RunSpace};
 use crate::world::World;
 use clap::ValueEnum;
@@ -55,8 +55,7 @@ pub(super) fn supervise(plan: &Plan<'_>, progress: impl FnMut(Position)) -> Resu
         }
     });
 
-    // What a killed supervisor of the same run may have left.
-    sweep(&plan.run);
+    claim(&plan.run)?;
     let (events, inbox) = unbounded();
     let mut family = Family { children: Vec::new(), events };
     let result = family.start(plan).and_then(|()| family.watch(&inbox, &signals, progress));
@@ -65,6 +64,20 @@ pub(super) fn supervise(plan: &Plan<'_>, progress: impl FnMut(Position)) -> Resu
     }
     sweep(&plan.run);
     result
+}
+
+/// Removes what a killed supervisor of the same run may have left, and refuses a run that is active: the
+/// parts started here would take the places of its own.
+fn claim(run: &RunName) -> Result<(), AppError> {
+    // The children of a supervisor killed just now are still on their way out.
+    let deadline = Instant::now() + GRACE / 2;
+    while !RunSpace::sweep(run).map_err(ProcessError::from)? {
+        if Instant::now() >= deadline {
+            return Err(ProcessError::AlreadyActive { run: run.to_string() }.into());
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    Ok(())
 }
 
 fn sweep(run: &RunName) {

@@ -95,15 +95,15 @@ pub enum ProcessError {
         /// How long.
         seconds: f64,
     },
-    /// A process of the run has died.
-    #[error("{who} (process {process_id}) has died; this one was waiting for {awaited}")]
+    /// A process of the run has ended or died.
+    #[error("{who} (process {process_id}) is gone; {consequence}")]
     PeerGone {
         /// Who.
         who: String,
         /// Its process id.
         process_id: u32,
-        /// What was waited for.
-        awaited: Awaited,
+        /// What that meant here.
+        consequence: String,
     },
     /// The scenario that came with the attach reply cannot be read.
     #[error("the scenario sent by the world cannot be read: {0}")]

@@ -1,6 +1,6 @@
 //! How a process waits for a frame: busily at first, then asleep, never for ever.
 
-use super::{Peers, ProcessError, StopFlag};
+use super::{Peer, Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, LockstepError, Progress};
 use crate::transport::iox::Bell;
 use ipc_schemas::{Role, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
@@ -87,6 +87,10 @@ impl Patience {
     }
 }
 
+fn peer_gone(peer: Peer, consequence: String) -> ProcessError {
+    ProcessError::PeerGone { who: peer.to_string(), process_id: peer.process_id, consequence }
+}
+
 /// Waits for one frame after another.
 #[derive(Debug)]
 pub struct Waiter {
@@ -102,6 +106,8 @@ pub struct Waiter {
 
 /// How often the clock is read while polling busily: reading it costs about as much as a poll.
 const POLLS_PER_LOOK: u32 = 64;
+/// How long a peer that has left the services may take to end.
+const LEAVING: Duration = Duration::from_millis(200);
 /// How often the peers are checked during a long wait.
 const PEER_CHECK: Duration = Duration::from_millis(50);
 
@@ -161,11 +167,7 @@ impl Waiter {
         if self.waited >= self.peers_checked + PEER_CHECK {
             self.peers_checked = self.waited;
             if let Some(peer) = self.peers.first_gone() {
-                return Err(ProcessError::PeerGone {
-                    who: peer.to_string(),
-                    process_id: peer.process_id,
-                    awaited,
-                });
+                return Err(peer_gone(peer, format!("this one was waiting for {awaited}")));
             }
         }
         Ok(())
@@ -177,11 +179,26 @@ impl Waiter {
         mut advance: impl FnMut() -> Result<Progress, LockstepError>,
     ) -> Result<(), ProcessError> {
         loop {
-            match advance()? {
+            match advance().map_err(|error| self.explain(error))? {
                 Progress::Finished => return Ok(()),
                 Progress::Advanced => self.reset(),
                 Progress::Waiting(awaited) => self.wait(awaited)?,
             }
+        }
+    }
+
+    /// Why the protocol broke: the end of a peer, if one ended, is the better explanation.
+    pub fn explain(&self, error: LockstepError) -> ProcessError {
+        // A peer first leaves the services and then ends.
+        let deadline = Instant::now() + LEAVING;
+        loop {
+            if let Some(peer) = self.peers.first_gone() {
+                return peer_gone(peer, error.to_string());
+            }
+            if Instant::now() >= deadline {
+                return error.into();
+            }
+            std::thread::sleep(NAP);
         }
     }
 }

@@ -206,7 +206,7 @@ pub fn run_world(
     let mut meter = StepMeter::start();
     let mut step = 0;
     loop {
-        match driver.advance()? {
+        match driver.advance().map_err(|error| waiter.explain(error))? {
             Progress::Finished => return Ok(meter.outcome(driver.world())),
             Progress::Waiting(awaited) => waiter.wait(awaited)?,
             Progress::Advanced => {

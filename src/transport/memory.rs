@@ -2,11 +2,11 @@
 
 use super::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
 use ipc_schemas::{FrameHeader, Record};
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::collections::VecDeque;
 use std::rc::Rc;
 
-/// Frames a receiver may leave untaken, as on the other transport.
+/// Frames of one sender a receiver may leave untaken, as on the other transport.
 const QUEUE_LIMIT: usize = 2;
 
 #[derive(Debug)]
@@ -15,19 +15,27 @@ struct Buffer<R> {
     records: Vec<R>,
 }
 
-type Queue<R> = Rc<RefCell<VecDeque<Rc<Buffer<R>>>>>;
+type Queue<R> = Rc<RefCell<VecDeque<Sent<R>>>>;
+
+/// A frame on its way, and which of the service's outboxes sent it.
+#[derive(Debug)]
+struct Sent<R> {
+    sender: usize,
+    buffer: Rc<Buffer<R>>,
+}
 
 /// A service within one thread. Make its inboxes first; outboxes send to those that exist by then.
 #[derive(Debug)]
 pub struct MemoryService<R> {
     name: &'static str,
     queues: Vec<Queue<R>>,
+    senders: Cell<usize>,
 }
 
 impl<R: Record> MemoryService<R> {
     /// A service without receivers.
     pub fn new(name: &'static str) -> MemoryService<R> {
-        MemoryService { name, queues: Vec::new() }
+        MemoryService { name, queues: Vec::new(), senders: Cell::new(0) }
     }
 
     /// A new receiver.
@@ -39,7 +47,8 @@ impl<R: Record> MemoryService<R> {
 
     /// A sender to all present receivers.
     pub fn outbox(&self) -> MemoryOutbox<R> {
-        MemoryOutbox { name: self.name, queues: self.queues.clone(), buffers: Vec::new() }
+        let sender = self.senders.replace(self.senders.get() + 1);
+        MemoryOutbox { name: self.name, sender, queues: self.queues.clone(), buffers: Vec::new() }
     }
 }
 
@@ -47,6 +56,8 @@ impl<R: Record> MemoryService<R> {
 #[derive(Debug)]
 pub struct MemoryOutbox<R> {
     name: &'static str,
+    /// Number among the outboxes of the service.
+    sender: usize,
     queues: Vec<Queue<R>>,
     /// Buffers sent before; those nobody reads any more are used again.
     buffers: Vec<Rc<Buffer<R>>>,
@@ -86,11 +97,13 @@ impl<R: Record> Loan<R> for MemoryLoan<'_, R> {
     }
 
     fn send(self) -> Result<usize, TransportError> {
-        if self.outbox.queues.iter().any(|q| q.borrow().len() >= QUEUE_LIMIT) {
+        let sender = self.outbox.sender;
+        let untaken = |queue: &Queue<R>| queue.borrow().iter().filter(|s| s.sender == sender).count();
+        if self.outbox.queues.iter().any(|q| untaken(q) >= QUEUE_LIMIT) {
             return Err(TransportError::ReceiverFull { service: self.outbox.name.to_owned() });
         }
         for queue in &self.outbox.queues {
-            queue.borrow_mut().push_back(self.buffer.clone());
+            queue.borrow_mut().push_back(Sent { sender, buffer: self.buffer.clone() });
         }
         self.outbox.buffers.push(self.buffer);
         Ok(self.outbox.queues.len())
@@ -107,7 +120,7 @@ impl<R: Record> Inbox<R> for MemoryInbox<R> {
     type Frame = MemoryFrame<R>;
 
     fn receive(&mut self) -> Result<Option<MemoryFrame<R>>, TransportError> {
-        Ok(self.queue.borrow_mut().pop_front().map(|buffer| MemoryFrame { buffer }))
+        Ok(self.queue.borrow_mut().pop_front().map(|sent| MemoryFrame { buffer: sent.buffer }))
     }
 }
 

@@ -1,0 +1,271 @@
+//! What the tests of whole processes share: programs in a runtime directory of their own, bounded waits
+//! that say what was waited for, and the search for what a run has left behind.
+
+#![allow(dead_code)] // every test file uses its part of this
+
+use rustix::process::{Pid, Signal, kill_process};
+use std::fs::File;
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::{Duration, Instant};
+use tempfile::TempDir;
+
+/// Longer than anything here takes on a loaded machine; shorter than anybody's patience.
+pub const LONG: Duration = Duration::from_secs(60);
+
+static NEXT: AtomicU32 = AtomicU32::new(0);
+
+/// A run name nobody else uses: /dev/shm is shared with all other tests.
+pub fn unique_name(tag: &str) -> String {
+    format!("{tag}-{}-{}", std::process::id(), NEXT.fetch_add(1, Ordering::Relaxed))
+}
+
+/// A runtime directory of its own, and the name of a run in it.
+#[derive(Debug)]
+pub struct Site {
+    runtime: TempDir,
+    logs: TempDir,
+    run: String,
+}
+
+impl Site {
+    pub fn new(tag: &str) -> Site {
+        // Short, because paths of sockets must be.
+        let directory = || tempfile::Builder::new().prefix("cz").tempdir().unwrap();
+        Site { runtime: directory(), logs: directory(), run: unique_name(tag) }
+    }
+
+    /// The run's name.
+    pub fn run(&self) -> &str {
+        &self.run
+    }
+
+    /// One of the four programs, in this site.
+    pub fn command(&self, program: &str) -> Command {
+        let path = match program {
+            "cz" => env!("CARGO_BIN_EXE_cz"),
+            "cz-world" => env!("CARGO_BIN_EXE_cz-world"),
+            "cz-coord" => env!("CARGO_BIN_EXE_cz-coord"),
+            "cz-ctrl" => env!("CARGO_BIN_EXE_cz-ctrl"),
+            other => panic!("there is no program {other}"),
+        };
+        let mut command = Command::new(path);
+        command.env("XDG_RUNTIME_DIR", self.runtime.path()).stdin(Stdio::null());
+        command
+    }
+
+    /// Starts a program that takes part in the site's run.
+    pub fn start(&self, program: &str, arguments: &[&str]) -> Process {
+        self.start_in(program, &self.run, arguments)
+    }
+
+    /// Starts a program that takes part in another run of the same runtime directory.
+    pub fn start_in(&self, program: &str, run: &str, arguments: &[&str]) -> Process {
+        let mut command = self.command(program);
+        if program == "cz" {
+            command.arg("run");
+        }
+        command.args(["--run", run]).args(arguments);
+        Process::start(format!("{program} --run {run} {}", arguments.join(" ")), command, self.logs.path())
+    }
+
+    /// Starts `cz run`, waits for its end, and returns its JSON summary.
+    pub fn summary(&self, arguments: &[&str]) -> serde_json::Value {
+        let mut all = vec!["--json", "-"];
+        all.extend(arguments);
+        self.start("cz", &all).ended().json()
+    }
+
+    /// Files of the site's run, in the runtime directory and in shared memory.
+    pub fn files(&self) -> Vec<PathBuf> {
+        files(Some(self.runtime.path()), &self.run)
+    }
+
+    /// Waits until nothing is set up any more: a world that waits for participants has then created all
+    /// its services.
+    pub fn wait_until_settled(&self) {
+        let mut before = (Vec::new(), Instant::now());
+        wait_until("the world to have set up its services", || {
+            let files = self.files();
+            if files != before.0 {
+                before = (files, Instant::now());
+            }
+            !before.0.is_empty() && before.1.elapsed() > Duration::from_millis(300)
+        });
+    }
+
+    /// Nothing of the run is left anywhere.
+    pub fn assert_clean(&self) {
+        assert_eq!(self.files(), Vec::<PathBuf>::new(), "left behind by run {}", self.run);
+        // With the last run the directory of all runs goes too.
+        let left: Vec<_> = std::fs::read_dir(self.runtime.path()).unwrap().flatten().collect();
+        assert!(left.is_empty(), "left in the runtime directory: {left:?}");
+    }
+}
+
+/// The files of a run: in shared memory, and below the given runtime directory.
+pub fn files(runtime: Option<&Path>, run: &str) -> Vec<PathBuf> {
+    let prefix = format!("cz_{}_{run}__", rustix::process::getuid().as_raw());
+    let entries = |d: &Path| std::fs::read_dir(d).into_iter().flatten().flatten().map(|e| e.path());
+    let named = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with(&prefix));
+    let mut found: Vec<_> = entries(Path::new("/dev/shm")).filter(named).collect();
+    let mut directories: Vec<_> = runtime.map(|r| r.join("cz").join(run)).into_iter().collect();
+    while let Some(directory) = directories.pop().filter(|d| d.exists()) {
+        directories.extend(entries(&directory).filter(|p| p.is_dir()));
+        found.extend(entries(&directory));
+        found.push(directory);
+    }
+    found.sort();
+    found
+}
+
+/// A program under test; killed when the test drops it, whatever happens.
+#[derive(Debug)]
+pub struct Process {
+    what: String,
+    child: Child,
+    out: PathBuf,
+    err: PathBuf,
+}
+
+impl Process {
+    fn start(what: String, mut command: Command, logs: &Path) -> Process {
+        // Into files, so that nobody ever waits for a reader.
+        let log = logs.join(NEXT.fetch_add(1, Ordering::Relaxed).to_string());
+        let (out, err) = (log.with_extension("out"), log.with_extension("err"));
+        let child = command
+            .stdout(File::create(&out).unwrap())
+            .stderr(File::create(&err).unwrap())
+            .spawn()
+            .unwrap_or_else(|e| panic!("cannot start {what}: {e}"));
+        Process { what, child, out, err }
+    }
+
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        send(self.id(), signal);
+    }
+
+    /// Waits for the end.
+    pub fn ended(self) -> Ended {
+        self.ended_within(LONG)
+    }
+
+    /// Waits for the end, no longer than that.
+    pub fn ended_within(mut self, limit: Duration) -> Ended {
+        let what = format!("`{}` to end", self.what);
+        let mut status = None;
+        wait_within(limit, &what, || {
+            status = self.child.try_wait().unwrap();
+            status.is_some()
+        });
+        let read = |path| std::fs::read_to_string(path).unwrap();
+        Ended {
+            what: self.what.clone(),
+            status: status.expect("the wait ended with a status"),
+            out: read(&self.out),
+            err: read(&self.err),
+        }
+    }
+}
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// How a program ended, and what it said.
+#[derive(Debug)]
+pub struct Ended {
+    pub what: String,
+    pub status: ExitStatus,
+    pub out: String,
+    pub err: String,
+}
+
+impl Ended {
+    /// Checks the exit code and that stderr has all the given words, on one line after the program's name.
+    pub fn expect(&self, code: i32, words: &[&str]) {
+        assert_eq!(self.status.code(), Some(code), "{self:?}");
+        for word in words {
+            assert!(self.err.contains(word), "no {word:?} in {self:?}");
+        }
+        assert!(!self.err.contains("panicked"), "{self:?}");
+    }
+
+    pub fn was_killed_by(&self, signal: Signal) -> bool {
+        self.status.signal() == Some(signal.as_raw())
+    }
+
+    /// The JSON summary, which must be all there is on stdout.
+    pub fn json(&self) -> serde_json::Value {
+        self.expect(0, &[]);
+        serde_json::from_str(&self.out).unwrap_or_else(|e| panic!("stdout is not JSON: {e}: {self:?}"))
+    }
+
+    /// The state hash in the JSON summary.
+    pub fn hash(&self) -> String {
+        hash(&self.json())
+    }
+}
+
+/// The state hash of a summary.
+pub fn hash(summary: &serde_json::Value) -> String {
+    summary["state_hash"].as_str().expect("state_hash is a string").to_owned()
+}
+
+/// Waits for something that must happen soon.
+pub fn wait_until(what: &str, happened: impl FnMut() -> bool) {
+    wait_within(LONG, what, happened);
+}
+
+/// Waits for something that must happen within that time.
+pub fn wait_within(limit: Duration, what: &str, mut happened: impl FnMut() -> bool) {
+    let start = Instant::now();
+    while !happened() {
+        assert!(start.elapsed() < limit, "waited {limit:?} for {what}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+pub fn send(process_id: u32, signal: Signal) {
+    let pid = Pid::from_raw(process_id as i32).expect("a process id is not 0");
+    kill_process(pid, signal).unwrap_or_else(|e| panic!("cannot send {signal:?} to {process_id}: {e}"));
+}
+
+/// The fields of /proc/PID/stat from the state on; `None` when there is no such process or it is a zombie.
+fn stat(process_id: u32) -> Option<Vec<String>> {
+    let stat = std::fs::read_to_string(format!("/proc/{process_id}/stat")).ok()?;
+    // The name before them is in parentheses and may hold any character.
+    let fields: Vec<_> = stat.rsplit(')').next()?.split_whitespace().map(str::to_owned).collect();
+    (fields[0] != "Z" && fields[0] != "X").then_some(fields)
+}
+
+pub fn is_alive(process_id: u32) -> bool {
+    stat(process_id).is_some()
+}
+
+/// Processor time a process has used, in ticks of 10 ms.
+pub fn ticks(process_id: u32) -> u64 {
+    stat(process_id).map_or(0, |f| f[11].parse::<u64>().unwrap() + f[12].parse::<u64>().unwrap())
+}
+
+/// The children of a process: their ids and command lines.
+pub fn children(process_id: u32) -> Vec<(u32, Vec<String>)> {
+    let parent = process_id.to_string();
+    let ids = std::fs::read_dir("/proc").unwrap().flatten();
+    ids.filter_map(|e| e.file_name().to_str()?.parse::<u32>().ok())
+        .filter(|&id| stat(id).is_some_and(|f| f[1] == parent))
+        .map(|id| {
+            let line = std::fs::read_to_string(format!("/proc/{id}/cmdline")).unwrap_or_default();
+            (id, line.split('\0').map(str::to_owned).collect())
+        })
+        .collect()
+}

@@ -1,0 +1,227 @@
+//! Whatever ends a run early: it ends within seconds, says why, and leaves nothing behind.
+
+mod common;
+
+use common::{Process, Site, children, is_alive, send, ticks, wait_until, wait_within};
+use rustix::process::Signal;
+use std::time::Duration;
+
+/// "Within seconds".
+const SOON: Duration = Duration::from_secs(5);
+/// For what the processes do by themselves once a peer is gone; the machine may be busy with other tests.
+const BY_THEMSELVES: Duration = Duration::from_secs(10);
+
+/// The two zones under steady demand for a thousand hours: no machine gets to the end of it.
+const ENDLESS: [&str; 11] = [
+    "varying-demand",
+    "--set",
+    "end.time_s=3600000",
+    "--set",
+    "roads.main1.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge1.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge2.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
+    "--peer-timeout",
+    "60",
+];
+
+/// A process that waits for others uses next to no processor time; one that steps uses all it gets.
+fn wait_until_stepping(world: u32) {
+    wait_until("the world to be stepping", || ticks(world) >= 30);
+}
+
+/// A `cz run` in the middle of things.
+struct Supervised {
+    supervisor: Process,
+    /// Subcommand and process id of each child.
+    parts: Vec<(String, u32)>,
+}
+
+impl Supervised {
+    fn start(site: &Site, arguments: &[&str], processes: usize) -> Supervised {
+        let supervisor = site.start("cz", &[&ENDLESS, arguments].concat());
+        let mut parts = Vec::new();
+        wait_until("the supervisor to have started the parts", || {
+            // Between fork and exec a child has the command line of its parent.
+            parts = children(supervisor.id())
+                .into_iter()
+                .filter_map(|(id, line)| line.get(1).filter(|part| *part != "run").map(|p| (p.clone(), id)))
+                .collect();
+            parts.len() == processes
+        });
+        let run = Supervised { supervisor, parts };
+        wait_until_stepping(run.part("world"));
+        run
+    }
+
+    fn part(&self, name: &str) -> u32 {
+        self.parts.iter().find(|(part, _)| part == name).unwrap_or_else(|| panic!("no {name}")).1
+    }
+
+    fn wait_until_parts_have_ended(&self, limit: Duration) {
+        for (part, id) in &self.parts {
+            wait_within(limit, &format!("the {part} process to end"), || !is_alive(*id));
+        }
+    }
+}
+
+#[test]
+fn an_interrupted_supervisor_ends_the_run() {
+    for (signal, name) in [(Signal::INT, "SIGINT"), (Signal::TERM, "SIGTERM")] {
+        let site = Site::new("int");
+        let run = Supervised::start(&site, &[], 3);
+        let parts = run.parts.clone();
+        run.supervisor.signal(signal);
+        run.supervisor.ended_within(SOON).expect(130, &["cz: interrupted by ", name]);
+        // It has waited for all of them.
+        assert!(parts.iter().all(|(_, id)| !is_alive(*id)));
+        site.assert_clean();
+    }
+}
+
+#[test]
+fn a_killed_part_ends_a_supervised_run() {
+    for (part, name) in [("world", "world"), ("coord", "coordinator 0"), ("ctrl", "controller 0")] {
+        let site = Site::new("kill");
+        let run = Supervised::start(&site, &[], 3);
+        let victim = run.part(part);
+        send(victim, Signal::KILL);
+        let parts = run.parts.clone();
+        let ended = run.supervisor.ended_within(SOON);
+        ended.expect(1, &["cz: ", &format!("{name} (process {victim}) was killed by signal 9 (SIGKILL)")]);
+        assert!(parts.iter().all(|(_, id)| !is_alive(*id)));
+        site.assert_clean();
+    }
+}
+
+#[test]
+fn a_killed_part_of_many_is_named() {
+    let site = Site::new("many");
+    let run = Supervised::start(&site, &["--ctrl-procs", "2", "--coord-procs", "2"], 5);
+    let parts = children(run.supervisor.id());
+    let second =
+        |(_, line): &&(u32, Vec<String>)| line[1] == "ctrl" && line.windows(2).any(|w| w == ["--index", "1"]);
+    let victim = parts.iter().find(second).expect("there is a second controller").0;
+    send(victim, Signal::KILL);
+    let ended = run.supervisor.ended_within(SOON);
+    ended.expect(1, &[&format!("controller 1 (process {victim}) was killed by signal 9 (SIGKILL)")]);
+    site.assert_clean();
+}
+
+#[test]
+fn a_terminated_part_ends_a_supervised_run() {
+    let site = Site::new("term");
+    let run = Supervised::start(&site, &[], 3);
+    let victim = run.part("ctrl");
+    send(victim, Signal::TERM);
+    let ended = run.supervisor.ended_within(SOON);
+    ended.expect(1, &[&format!("controller 0 (process {victim}) ended with code 130: interrupted")]);
+    site.assert_clean();
+}
+
+#[test]
+fn a_killed_supervisor_takes_its_children_with_it() {
+    let site = Site::new("orphan");
+    let run = Supervised::start(&site, &[], 3);
+    run.supervisor.signal(Signal::KILL);
+    run.wait_until_parts_have_ended(SOON);
+    assert!(run.supervisor.ended().was_killed_by(Signal::KILL));
+    site.assert_clean();
+}
+
+#[test]
+fn the_next_start_clears_up_after_a_massacre() {
+    let site = Site::new("all");
+    let run = Supervised::start(&site, &[], 3);
+    // Stopped first, so that none of them notices the death of another.
+    run.supervisor.signal(Signal::STOP);
+    run.parts.iter().for_each(|(_, id)| send(*id, Signal::STOP));
+    run.parts.iter().for_each(|(_, id)| send(*id, Signal::KILL));
+    run.supervisor.signal(Signal::KILL);
+    run.wait_until_parts_have_ended(SOON);
+    assert!(run.supervisor.ended().was_killed_by(Signal::KILL));
+    assert_ne!(site.files(), Vec::<std::path::PathBuf>::new(), "killed processes leave files");
+    let again = ["two-merges", "--run", site.run()];
+    let elsewhere = Site::new("e").summary(&["--in-process"]);
+    let mut command = site.command("cz");
+    let output = command.args(["run", "--json", "-"]).args(again).output().unwrap();
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(summary["state_hash"], elsewhere["state_hash"]);
+    site.assert_clean();
+}
+
+#[test]
+fn a_world_that_waits_can_be_interrupted() {
+    for (signal, program) in [(Signal::INT, "cz-world"), (Signal::TERM, "cz-ctrl"), (Signal::INT, "cz-coord")]
+    {
+        let site = Site::new("wait");
+        let part = site.start(program, &[]);
+        site.wait_until_settled();
+        part.signal(signal);
+        part.ended_within(SOON).expect(130, &[&format!("{program}: interrupted")]);
+        site.assert_clean();
+    }
+}
+
+/// The parts of a run started by hand, in the middle of things.
+fn by_hand(site: &Site) -> [Process; 3] {
+    let world = site.start("cz-world", &ENDLESS);
+    let parts = [site.start("cz-coord", &[]), site.start("cz-ctrl", &[])];
+    wait_until_stepping(world.id());
+    let [coordinator, controller] = parts;
+    [world, coordinator, controller]
+}
+
+#[test]
+fn a_killed_part_ends_a_run_started_by_hand() {
+    let names = ["the world", "coordinator 0", "controller 0"];
+    for victim in 0..3 {
+        let site = Site::new("hand");
+        let parts = by_hand(&site);
+        let id = parts[victim].id();
+        let dead = format!("{} (process {id})", names[victim]);
+        let world = format!("the world (process {})", parts[0].id());
+        parts[victim].signal(Signal::KILL);
+        for (i, part) in parts.into_iter().enumerate() {
+            let ended = part.ended_within(BY_THEMSELVES);
+            if i == victim {
+                assert!(ended.was_killed_by(Signal::KILL), "{ended:?}");
+            } else if i == 0 {
+                // The world knows everybody.
+                ended.expect(1, &["cz-world: ", &dead, "gone"]);
+            } else {
+                // The others know only the world, which has gone after saying why.
+                ended.expect(1, &[&world, "gone"]);
+            }
+        }
+        site.assert_clean();
+    }
+}
+
+#[test]
+fn an_interrupted_part_ends_a_run_started_by_hand() {
+    let site = Site::new("handint");
+    let [world, coordinator, controller] = by_hand(&site);
+    world.signal(Signal::INT);
+    world.ended_within(BY_THEMSELVES).expect(130, &["cz-world: interrupted at step "]);
+    coordinator.ended_within(BY_THEMSELVES).expect(1, &["the world", "gone"]);
+    controller.ended_within(BY_THEMSELVES).expect(1, &["the world", "gone"]);
+    site.assert_clean();
+}
+
+#[test]
+fn a_part_that_stops_answering_is_given_up() {
+    let site = Site::new("stuck");
+    let mut arguments = ENDLESS;
+    arguments[10] = "1"; // --peer-timeout
+    let world = site.start("cz-world", &arguments);
+    let (coordinator, controller) = (site.start("cz-coord", &[]), site.start("cz-ctrl", &[]));
+    wait_until_stepping(world.id());
+    controller.signal(Signal::STOP);
+    world.ended_within(BY_THEMSELVES).expect(1, &["waited 1 s for commands of step ", "controller 0"]);
+    coordinator.ended_within(BY_THEMSELVES).expect(1, &["the world", "gone"]);
+    controller.signal(Signal::CONT);
+    controller.ended_within(BY_THEMSELVES).expect(1, &["the world", "gone"]);
+    site.assert_clean();
+}

@@ -1,0 +1,136 @@
+//! The same scenario and seed give the same states, however the work is spread over processes.
+
+mod common;
+
+use common::{Site, hash};
+use serde_json::Value;
+use std::sync::Mutex;
+
+/// State hashes of in-process runs, by scenario, for the seeds 1 to 3.
+///
+/// When they differ from what a run gives, something that decides where vehicles drive has changed: the
+/// law, the coordinators, the world, the arrivals, the layout of the state record, or an embedded scenario.
+const GOLDEN: [(&str, [&str; 3]); 4] = [
+    ("two-merges", ["615e87249914cb98", "528ff020f95b5d5e", "9cce8ee0eb8c9bc4"]),
+    ("varying-demand", ["e0a8fbeaddf7c3f7", "3eddbb8299ff70ac", "19983e4ca67be674"]),
+    ("corridor-8", ["c1e909f88f40aabe", "5e77a80a0cd287d8", "2d5a59944aac8edb"]),
+    ("tree", ["6feb76db58ddc81c", "b0c514522b0c5c78", "97199d953b03c4a3"]),
+];
+
+/// Runs of several processes keep two cores busy: one at a time is faster than two.
+static PROCESSES: Mutex<()> = Mutex::new(());
+
+fn run(scenario: &str, seed: u64, arguments: &[&str]) -> Value {
+    let seed = seed.to_string();
+    let mut all = vec![scenario, "--seed", &seed];
+    all.extend(arguments);
+    let _alone = PROCESSES.lock();
+    let site = Site::new("h");
+    let summary = site.summary(&all);
+    site.assert_clean();
+    summary
+}
+
+fn check(scenario: &str) {
+    let golden = GOLDEN.iter().find(|(name, _)| *name == scenario).unwrap().1;
+    for (seed, golden) in (1..=3).zip(golden) {
+        let in_process = run(scenario, seed, &["--in-process"]);
+        check_keys(&in_process, scenario, seed);
+        let expected = hash(&in_process);
+        // Every way of sharing out once per scenario; what costs seconds only for the first seed.
+        let mut ways: Vec<&[&str]> =
+            vec![&["--in-process"], &["--in-process", "--ctrl-procs", "2", "--coord-procs", "2"], &[]];
+        if seed == 1 || scenario == "two-merges" {
+            ways.extend([
+                &["--ctrl-procs", "2"][..],
+                &["--coord-procs", "2"],
+                &["--ctrl-procs", "2", "--coord-procs", "2"],
+                &[],
+            ]);
+        }
+        for way in ways {
+            let summary = run(scenario, seed, way);
+            check_keys(&summary, scenario, seed);
+            assert_eq!(hash(&summary), expected, "{scenario}, seed {seed}, {way:?}");
+            // Equal states, equal results.
+            for key in ["steps", "zones", "total_objective", "arrived", "departed"] {
+                assert_eq!(summary[key], in_process[key], "{scenario}, seed {seed}, {way:?}");
+            }
+        }
+        assert_eq!(
+            expected, golden,
+            "{scenario}, seed {seed}: vehicles drive differently than before. If that is meant (say why in \
+             CHANGELOG), write the new hash into GOLDEN; if nothing of the kind was to change, it is a bug"
+        );
+    }
+}
+
+/// The summary's keys are a contract.
+fn check_keys(summary: &Value, scenario: &str, seed: u64) {
+    assert_eq!(summary["scenario"], scenario);
+    assert_eq!(summary["seed"], seed);
+    assert!(matches!(summary["transport"].as_str(), Some("in-process" | "iceoryx2")), "{summary}");
+    assert!(summary["processes"].as_u64().is_some_and(|n| n >= 1), "{summary}");
+    assert!(summary["steps"].as_u64().is_some_and(|n| n > 100), "{summary}");
+    let hash = summary["state_hash"].as_str().unwrap();
+    assert!(hash.len() == 16 && u64::from_str_radix(hash, 16).is_ok(), "{summary}");
+    for key in ["dt_s", "beta", "wall_s", "total_objective"] {
+        assert!(summary[key].as_f64().is_some_and(|x| x > 0.0), "{key}: {summary}");
+    }
+    let mut before = 0.0;
+    for key in ["p50", "p99", "p999", "max"] {
+        let latency = summary["step_latency_us"][key].as_f64().unwrap_or_else(|| panic!("{key}: {summary}"));
+        assert!(latency >= before && latency > 0.0, "{key}: {summary}");
+        before = latency;
+    }
+    let zones = summary["zones"].as_array().unwrap();
+    assert!(!zones.is_empty());
+    let mut total = 0.0;
+    for zone in zones {
+        assert!(zone["zone"].as_str().is_some_and(|name| !name.is_empty()), "{zone}");
+        for key in ["vehicles", "fe_vehicles", "infeasible_vehicles"] {
+            assert!(zone[key].is_u64(), "{key}: {zone}");
+        }
+        for key in [
+            "mean_time_s",
+            "mean_energy",
+            "mean_objective",
+            "fe_mean_s",
+            // `null` where no vehicle had a partner, which happens in none of these scenarios.
+            "min_rear_end_margin_m",
+            "min_merge_margin_m",
+        ] {
+            assert!(zone[key].is_f64(), "{key}: {zone}");
+        }
+        total += zone["mean_objective"].as_f64().unwrap();
+    }
+    assert!((summary["total_objective"].as_f64().unwrap() - total).abs() < 1e-9, "{summary}");
+}
+
+#[test]
+fn two_merges() {
+    check("two-merges");
+}
+
+#[test]
+fn varying_demand() {
+    check("varying-demand");
+}
+
+#[test]
+fn corridor_8() {
+    check("corridor-8");
+}
+
+#[test]
+fn tree() {
+    check("tree");
+}
+
+#[test]
+fn the_summary_says_how_the_frames_travelled() {
+    let summary = run("two-merges", 1, &["--in-process", "--ctrl-procs", "2"]);
+    assert_eq!((&summary["transport"], &summary["processes"]), (&"in-process".into(), &1.into()));
+    let summary = run("two-merges", 1, &["--ctrl-procs", "2", "--coord-procs", "2"]);
+    assert_eq!((&summary["transport"], &summary["processes"]), (&"iceoryx2".into(), &5.into()));
+}
