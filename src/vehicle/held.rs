@@ -73,6 +73,16 @@ impl Held {
         let margin = |t: f64| {
             leader.position_m(t) - self.position_m(t) + shift_m - reaction_s * self.speed_mps(t) - gap_m
         };
+        if within_s <= self.stop_s && within_s <= leader.stop_s {
+            // Nobody stops on the way: one parabola.
+            let start = margin(0.0);
+            let slope = leader.v0_mps - self.v0_mps - reaction_s * self.u_mps2;
+            let curvature = leader.u_mps2 - self.u_mps2;
+            let end = start + (slope + 0.5 * curvature * within_s) * within_s;
+            let turns = slope < 0.0 && slope + curvature * within_s > 0.0;
+            let least = start.min(end);
+            return if turns { least.min(start - 0.5 * slope * slope / curvature) } else { least };
+        }
         let mut least = margin(0.0).min(margin(within_s));
         // Between the instants at which one of the two stops, the margin is a parabola.
         let mut from = 0.0;

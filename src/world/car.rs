@@ -13,9 +13,7 @@ pub(super) struct Car {
     pub v_mps: f64,
     /// Acceleration an observer saw over the step just ended, m/s^2.
     pub u_mps2: f64,
-    /// Acceleration commanded for the coming step, m/s^2.
-    pub command_mps2: f64,
-    /// Motion over the step being integrated.
+    /// Motion over the coming step, set by the vehicle's command (on a link: by its driver).
     pub held: Held,
     pub entry_time_s: f64,
     pub entry_speed_mps: f64,
@@ -60,7 +58,6 @@ impl Car {
             x_m: 0.0,
             v_mps: entry_speed_mps,
             u_mps2: 0.0,
-            command_mps2: 0.0,
             held: Held::new(0.0, entry_speed_mps, 0.0),
             entry_time_s,
             entry_speed_mps,

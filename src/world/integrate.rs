@@ -21,29 +21,22 @@ impl World {
         let scenario = self.scenario.clone();
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
-        self.hold_commands();
         self.drive_links(&scenario, dt_s);
-        self.follow_left();
         self.entries.clear();
+        // All that concerns a zone at one go, while its vehicles are in the cache. Motions start from the
+        // step's beginning, so it does not matter which zone has moved on already.
         for zone in 0..self.zones.len() {
+            self.follow_left(zone);
             account_margins(&scenario, zone, &mut self.zones[zone], &mut self.metrics[zone], dt_s);
             self.leave_zone(&scenario, zone, now_s, dt_s);
+            self.settle(zone, dt_s);
         }
         for zone in 0..self.links.len() {
             self.leave_link(&scenario, zone, now_s, dt_s);
+            self.links[zone].cars.iter_mut().for_each(|car| move_on(car, dt_s));
         }
         self.admit(&scenario, now_s, dt_s);
-        self.settle(dt_s);
         self.enter();
-    }
-
-    fn hold_commands(&mut self) {
-        for traffic in &mut self.zones {
-            for car in &mut traffic.cars {
-                car.held = Held::new(car.x_m, car.v_mps, car.command_mps2);
-                self.held_u_mps2[car.vehicle as usize] = car.command_mps2;
-            }
-        }
     }
 
     /// Lets vehicles on links choose, front first, so that each sees what its leader will do.
@@ -65,13 +58,11 @@ impl World {
         }
     }
 
-    /// Moves each zone's index 0 with the vehicle it stands for.
-    fn follow_left(&mut self) {
-        for traffic in &mut self.zones {
-            if let Some(left) = &mut traffic.left {
-                let u = self.held_u_mps2[left.car.vehicle as usize];
-                left.car.held = Held::new(left.car.x_m, left.car.v_mps, u);
-            }
+    /// Moves a zone's index 0 with the vehicle it stands for.
+    fn follow_left(&mut self, zone: usize) {
+        if let Some(left) = &mut self.zones[zone].left {
+            let u = self.held_u_mps2[left.car.vehicle as usize];
+            left.car.held = Held::new(left.car.x_m, left.car.v_mps, u);
         }
     }
 
@@ -204,25 +195,16 @@ impl World {
         }
     }
 
-    /// Moves everyone who stays to the end of the step.
-    fn settle(&mut self, dt_s: f64) {
-        let settle = |car: &mut Car| {
-            car.x_m = car.held.position_m(dt_s);
-            car.v_mps = car.held.speed_mps(dt_s);
-            car.u_mps2 = car.held.observed_mps2(dt_s);
-        };
-        for traffic in &mut self.zones {
-            if let Some(left) = &mut traffic.left {
-                settle(&mut left.car);
-            }
-            for car in &mut traffic.cars {
-                car.visit.energy += car.held.energy(dt_s);
-                car.entered = false;
-                settle(car);
-            }
+    /// Moves everyone who stays in a zone to the end of the step.
+    fn settle(&mut self, zone: usize, dt_s: f64) {
+        let traffic = &mut self.zones[zone];
+        if let Some(left) = &mut traffic.left {
+            move_on(&mut left.car, dt_s);
         }
-        for link in &mut self.links {
-            link.cars.iter_mut().for_each(settle);
+        for car in &mut traffic.cars {
+            car.visit.energy += car.held.energy(dt_s);
+            car.entered = false;
+            move_on(car, dt_s);
         }
     }
 
@@ -236,6 +218,13 @@ impl World {
             self.zones[entry.zone as usize].cars.push(entry.car);
         }
     }
+}
+
+/// Moves a vehicle to the end of the step.
+fn move_on(car: &mut Car, dt_s: f64) {
+    car.x_m = car.held.position_m(dt_s);
+    car.v_mps = car.held.speed_mps(dt_s);
+    car.u_mps2 = car.held.observed_mps2(dt_s);
 }
 
 /// Updates the least rear-end margins over the step and notes, for vehicles seen for the first time,

@@ -6,6 +6,7 @@ use super::link::Link;
 use super::metrics::{WorldSummary, ZoneMetrics};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Exit, Scenario};
+use crate::vehicle::Held;
 use ipc_schemas::{self as frames, VehicleCommand, VehicleState};
 use std::sync::Arc;
 use xxhash_rust::xxh3::xxh3_64_with_seed;
@@ -303,7 +304,8 @@ impl World {
                         max_mps2: limits.u_max_mps2,
                     });
                 }
-                car.command_mps2 = u;
+                car.held = Held::new(car.x_m, car.v_mps, u);
+                self.held_u_mps2[car.vehicle as usize] = u;
                 car.planned_exit_time_s = command.planned_exit_time_s;
                 car.planned_exit_speed_mps = command.planned_exit_speed_mps;
                 if command.verdict == frames::VERDICT_FE {
