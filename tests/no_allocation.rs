@@ -1,0 +1,102 @@
+//! The hot path allocates nothing: a steady step, all roles together, over both transports.
+
+use control_zones::control::ControllerPool;
+use control_zones::coordination::Coordinator;
+use control_zones::lockstep::in_process::InProcess;
+use control_zones::lockstep::{
+    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity, Progress, WorldDriver,
+    WorldPorts,
+};
+use control_zones::scenario::{Override, Scenario, load};
+use control_zones::transport::iox::{IoxOutbox, RunSpace, ServiceLimits};
+use control_zones::world::World;
+use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Light traffic, so that there are many steps without events.
+fn scenario() -> Arc<Scenario> {
+    let set: Vec<Override> = ["end.vehicles=400"].iter().map(|s| s.parse().unwrap()).collect();
+    Arc::new(load(Some("varying-demand"), &set, Some(1)).unwrap())
+}
+
+/// Steps after which every buffer has grown to what the run needs.
+const WARM_UP: u64 = 6_000;
+
+#[test]
+fn steady_steps_in_one_process_allocate_nothing() {
+    let mut run = InProcess::new(&scenario(), 1, 1);
+    let (mut steady, mut more) = (0, true);
+    while more {
+        let measured = allocation_counter::measure(|| more = run.step().unwrap());
+        if run.world().step() > WARM_UP && !run.was_event() && more {
+            steady += 1;
+            assert_eq!(measured.count_total, 0, "allocations in step {}", run.world().step());
+        }
+    }
+    assert!(steady >= 5_000, "only {steady} steady steps were seen");
+}
+
+#[test]
+fn steady_steps_over_shared_memory_allocate_nothing() {
+    let scenario = scenario();
+    let run = format!("alloc-{}", std::process::id()).parse().unwrap();
+    let space = RunSpace::enter(&run).unwrap();
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 1 };
+    let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits).unwrap();
+    let coordinator_state = space.create::<VehicleState>("cz/coordinator-state/0", limits).unwrap();
+    let coordination = space.create::<Assignment>(frames::SERVICE_COORDINATION, limits).unwrap();
+    let summaries = space.create::<ZoneSummary>("cz/summary/0", limits).unwrap();
+    let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits).unwrap();
+    let zones = 0..scenario.network.zones.len() as u32;
+    let identity = |role| Identity { run_id: 7, role, index: 0, generation: 0 };
+    let neighbours: Vec<(u16, Range<u32>, IoxOutbox<ZoneSummary>)> = Vec::new();
+    let mut coordinator = CoordinatorDriver::new(
+        Coordinator::new(scenario.clone(), zones.clone()),
+        CoordinatorPorts {
+            state: coordinator_state.inbox().unwrap(),
+            summaries: summaries.inbox().unwrap(),
+            neighbours,
+            coordination: coordination.outbox(256).unwrap(),
+        },
+        identity(Role::Coordinator),
+        1,
+    );
+    let mut controller = ControllerDriver::new(
+        ControllerPool::new(scenario.clone(), zones),
+        ControllerPorts {
+            state: state.inbox().unwrap(),
+            coordination: coordination.inbox().unwrap(),
+            command: command.outbox(256).unwrap(),
+        },
+        identity(Role::Controller),
+        0,
+    );
+    let ports = WorldPorts {
+        state: state.outbox(256).unwrap(),
+        coordinator_states: vec![coordinator_state.outbox(256).unwrap()],
+        command: command.inbox().unwrap(),
+    };
+    let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, 7, 1);
+    let (mut steady, mut finished) = (0, false);
+    while !finished {
+        let step = world.world().step();
+        let measured = allocation_counter::measure(|| {
+            while world.world().step() == step && !finished {
+                finished = world.advance().unwrap() == Progress::Finished;
+                while coordinator.advance().unwrap() == Progress::Advanced {}
+                while controller.advance().unwrap() == Progress::Advanced {}
+            }
+        });
+        if step > WARM_UP && !world.was_event() && !finished {
+            steady += 1;
+            assert_eq!(measured.count_total, 0, "allocations in step {step}");
+        }
+    }
+    assert!(steady >= 5_000, "only {steady} steady steps were seen");
+    assert_eq!(world.world().state_hash(), {
+        let mut same = InProcess::new(&scenario, 1, 1);
+        same.run().unwrap();
+        same.world().state_hash()
+    });
+}
