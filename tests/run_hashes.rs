@@ -1,5 +1,7 @@
 //! The same scenario and seed give the same states, however the work is spread over processes.
 
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
 mod common;
 
 use common::{Site, hash};
@@ -125,6 +127,19 @@ fn corridor_8() {
 #[test]
 fn tree() {
     check("tree");
+}
+
+#[test]
+fn a_process_for_every_zone() {
+    // Short, because so many processes on few cores are slow.
+    let short = ["--set", "end.time_s=60"];
+    let expected = hash(&run("tree", 1, &[&short[..], &["--in-process"]].concat()));
+    let every = ["--ctrl-procs", "5", "--coord-procs", "5"];
+    for way in [&["--in-process"][..], &[]] {
+        assert_eq!(hash(&run("tree", 1, &[&short[..], &every, way].concat())), expected, "{way:?}");
+    }
+    let every = ["--in-process", "--ctrl-procs", "8", "--coord-procs", "8"];
+    assert_eq!(hash(&run("corridor-8", 1, &every)), GOLDEN[2].1[0]);
 }
 
 #[test]
