@@ -9,7 +9,7 @@ use control_zones::scenario::{
 use control_zones::world::{World, WorldSummary};
 use ipc_schemas::{NO_ZONE, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState};
 use proptest::prelude::*;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
 /// Demand ends after this, s; the run goes on until everybody has left, or for [`END_S`].
@@ -259,6 +259,12 @@ struct Pairs {
     had_room: HashMap<(u32, u32, u32), bool>,
     /// Somebody has passed a leader.
     passed: bool,
+    /// Zones somebody entered too fast to stop before the conflict point.
+    too_fast: HashSet<u32>,
+}
+
+fn stopping_m(v_mps: f64) -> f64 {
+    v_mps * v_mps / (2.0 * BRAKING_MPS2)
 }
 
 impl Pairs {
@@ -279,16 +285,19 @@ impl Pairs {
     ///   with a negative margin asks for a return to the distance, not for a stop before the leader: with
     ///   k1 = 0.5, one was 0.1 m past a standing leader at L/4 + 4 m, still braking.
     fn check(&mut self, scenario: &Scenario, step: u64, zone: &[VehicleState]) -> Result<(), TestCaseError> {
-        let stopping_m = |v_mps: f64| v_mps * v_mps / (2.0 * BRAKING_MPS2);
         let approaches = &scenario.network.zones[zone[0].zone as usize].approaches;
         for (i, r) in zone.iter().enumerate().filter(|(_, r)| r.flags & STATE_LEFT == 0) {
+            let length_m = approaches[r.path as usize].length_m;
+            if r.flags & STATE_ENTERED != 0 && r.x_m + stopping_m(r.v_mps) > length_m {
+                self.too_fast.insert(r.zone);
+            }
             let Some(leader) = zone[..i].iter().rev().find(|p| p.path == r.path) else { continue };
             let gap_m = leader.x_m - r.x_m;
             let had_room = *self
                 .had_room
                 .entry((r.zone, r.vehicle, leader.vehicle))
                 .or_insert(gap_m + stopping_m(leader.v_mps) - stopping_m(r.v_mps) >= 0.0);
-            let enforced = r.x_m <= scenario.control.fe_fraction * approaches[r.path as usize].length_m;
+            let enforced = r.x_m <= scenario.control.fe_fraction * length_m;
             prop_assert!(
                 gap_m >= floor_m(scenario) - 1e-9 || !(had_room && enforced),
                 "step {step}: {r:?} has passed {leader:?}"
@@ -299,8 +308,9 @@ impl Pairs {
     }
 }
 
-/// Runs step by step, checking every frame.
-fn watched_run(scenario: &Arc<Scenario>) -> Result<WorldSummary, TestCaseError> {
+/// Runs step by step, checking every frame. Returns the results, and the zones somebody entered too fast
+/// to stop in.
+fn watched_run(scenario: &Arc<Scenario>) -> Result<(WorldSummary, HashSet<u32>), TestCaseError> {
     let mut run = InProcess::new(scenario, 1, 1);
     let mut seen = Vec::new();
     let mut pairs = Pairs::default();
@@ -316,7 +326,7 @@ fn watched_run(scenario: &Arc<Scenario>) -> Result<WorldSummary, TestCaseError> 
             let summary = run.world().summary();
             let counted = summary.zones.iter().any(|z| z.overtakes > 0);
             prop_assert_eq!(pairs.passed, counted, "what the world counts as overtakes");
-            return Ok(summary);
+            return Ok((summary, pairs.too_fast));
         }
     }
 }
@@ -351,14 +361,22 @@ fn check_floor(scenario: &Scenario, summary: &WorldSummary) -> Result<(), TestCa
     Ok(())
 }
 
-/// Vehicles pass the conflict point in the order in which they entered.
+/// Vehicles pass the conflict point in the order in which they entered, with two exceptions:
 ///
-/// As with the floor, feasibility rows are what keeps the merging row satisfiable. Without them FIFO broke in
-/// one of 1 700 networks: 9 of the zone's 22 vehicles met an infeasible QP, one crossed 1.2 m too close
-/// and two out of order.
-fn check_order(scenario: &Scenario, summary: &WorldSummary) -> Result<(), TestCaseError> {
-    for zone in &summary.zones {
-        if scenario.control.feasibility_rows || zone.infeasible_vehicles == 0 {
+/// - Where somebody entered too fast to stop before the conflict point at all. FIFO goes by entry, also
+///   where approaches differ in length: 26 m/s on an approach of 80 m, behind a vehicle that entered
+///   earlier at 9 m/s with 318 m to go, passes first whatever it does.
+/// - Feasibility rows are what keeps the merging row satisfiable, as they do the rear-end row. Without them
+///   the order broke in one of 1 700 networks: 9 of the zone's 22 vehicles met an infeasible QP, one crossed
+///   1.2 m too close and two out of order.
+fn check_order(
+    scenario: &Scenario,
+    summary: &WorldSummary,
+    too_fast: &HashSet<u32>,
+) -> Result<(), TestCaseError> {
+    for (zone, index) in summary.zones.iter().zip(0..) {
+        let feasible = scenario.control.feasibility_rows || zone.infeasible_vehicles == 0;
+        if feasible && !too_fast.contains(&index) {
             prop_assert_eq!(zone.order_violations, 0, "{:?}", zone);
         }
     }
@@ -371,8 +389,8 @@ proptest! {
     #[test]
     fn a_network(scenario in scenario()) {
         let scenario = Arc::new(scenario);
-        let summary = watched_run(&scenario)?;
-        check_order(&scenario, &summary)?;
+        let (summary, too_fast) = watched_run(&scenario)?;
+        check_order(&scenario, &summary, &too_fast)?;
         check_floor(&scenario, &summary)?;
         // Neither running again nor sharing the work out changes a bit.
         let zones = scenario.network.zones.len() as u32;
