@@ -1,5 +1,7 @@
 //! The command line: what it prints, what it refuses, and with which exit code.
 
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
 mod common;
 
 use assert_cmd::Command;

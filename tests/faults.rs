@@ -1,5 +1,7 @@
 //! Whatever ends a run early: it ends within seconds, says why, and leaves nothing behind.
 
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
 mod common;
 
 use common::{Process, Site, children, is_alive, send, ticks, wait_until, wait_within};

@@ -1,5 +1,7 @@
 //! The parts of a run started by hand: in any order, side by side, and turned away where they do not fit.
 
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
 mod common;
 
 use common::{Ended, Site, files, unique_name, wait_until};

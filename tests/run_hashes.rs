@@ -1,5 +1,7 @@
 //! The same scenario and seed give the same states, however the work is spread over processes.
 
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
 mod common;
 
 use common::{Site, hash};
@@ -11,7 +13,7 @@ use std::sync::Mutex;
 /// When they differ from what a run gives, something that decides where vehicles drive has changed: the
 /// law, the coordinators, the world, the arrivals, the layout of the state record, or an embedded scenario.
 const GOLDEN: [(&str, [&str; 3]); 4] = [
-    ("two-merges", ["615e87249914cb98", "528ff020f95b5d5e", "9cce8ee0eb8c9bc4"]),
+    ("two-merges", ["4bd61fbe17f858e7", "33da63d44a5bf155", "9cce8ee0eb8c9bc4"]),
     ("varying-demand", ["e0a8fbeaddf7c3f7", "3eddbb8299ff70ac", "19983e4ca67be674"]),
     ("corridor-8", ["c1e909f88f40aabe", "5e77a80a0cd287d8", "2d5a59944aac8edb"]),
     ("tree", ["6feb76db58ddc81c", "b0c514522b0c5c78", "97199d953b03c4a3"]),
@@ -125,6 +127,19 @@ fn corridor_8() {
 #[test]
 fn tree() {
     check("tree");
+}
+
+#[test]
+fn a_process_for_every_zone() {
+    // Short, because so many processes on few cores are slow.
+    let short = ["--set", "end.time_s=60"];
+    let expected = hash(&run("tree", 1, &[&short[..], &["--in-process"]].concat()));
+    let every = ["--ctrl-procs", "5", "--coord-procs", "5"];
+    for way in [&["--in-process"][..], &[]] {
+        assert_eq!(hash(&run("tree", 1, &[&short[..], &every, way].concat())), expected, "{way:?}");
+    }
+    let every = ["--in-process", "--ctrl-procs", "8", "--coord-procs", "8"];
+    assert_eq!(hash(&run("corridor-8", 1, &every)), GOLDEN[2].1[0]);
 }
 
 #[test]

@@ -168,7 +168,8 @@ impl World {
                 });
             while let Some(waiting) = self.gates.waiting[index].front_mut() {
                 let mut speed_mps = waiting.arrival.speed_mps;
-                let mut after_s = waiting.arrival.time_s - now_s;
+                // An arrival at the very end of the step may come out a rounding later.
+                let mut after_s = (waiting.arrival.time_s - now_s).min(dt_s);
                 if waiting.held {
                     after_s = dt_s;
                     speed_mps = leader.map_or(speed_mps, |l| speed_mps.min(l.speed_mps(dt_s)));

@@ -2,6 +2,7 @@
 //! that say what was waited for, and the search for what a run has left behind.
 
 #![allow(dead_code)] // every test file uses its part of this
+#![allow(clippy::unwrap_used)] // as in the tests themselves
 
 use rustix::process::{Pid, Signal, kill_process};
 use std::fs::File;

@@ -1,0 +1,310 @@
+//! One suite for all transports: what a sender and its receivers may rely on.
+
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
+mod common;
+
+use common::unique_name;
+use control_zones::transport::iox::{IoxInbox, IoxOutbox, RunName, RunSpace, Service, ServiceLimits};
+use control_zones::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
+use control_zones::transport::{Frame, Inbox, Loan, Outbox, TransportError};
+use ipc_schemas::{FrameHeader, VehicleCommand, schema_hash};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+
+/// Frames are laid out for this many records at first.
+const EXPECTED: usize = 4;
+const SERVICE: &str = "cz/conformance";
+
+/// A service with its ends.
+trait Bench {
+    type Out: Outbox<VehicleCommand>;
+    type In: Inbox<VehicleCommand>;
+
+    /// A new service with so many senders and receivers.
+    fn open(senders: usize, receivers: usize) -> Self;
+    /// The ends, to be taken by index.
+    fn ends(&mut self) -> (&mut [Self::Out], &mut [Self::In]);
+}
+
+struct Memory(Vec<MemoryOutbox<VehicleCommand>>, Vec<MemoryInbox<VehicleCommand>>);
+
+impl Bench for Memory {
+    type Out = MemoryOutbox<VehicleCommand>;
+    type In = MemoryInbox<VehicleCommand>;
+
+    fn open(senders: usize, receivers: usize) -> Memory {
+        let mut service = MemoryService::new(SERVICE);
+        let inboxes = (0..receivers).map(|_| service.inbox()).collect();
+        Memory((0..senders).map(|_| service.outbox()).collect(), inboxes)
+    }
+
+    fn ends(&mut self) -> (&mut [Self::Out], &mut [Self::In]) {
+        (&mut self.0, &mut self.1)
+    }
+}
+
+/// Fields are dropped in order: the ends before the service, the service before the space.
+struct Iceoryx2 {
+    outboxes: Vec<IoxOutbox<VehicleCommand>>,
+    inboxes: Vec<IoxInbox<VehicleCommand>>,
+    _service: Service<VehicleCommand>,
+    _space: RunSpace,
+}
+
+impl Bench for Iceoryx2 {
+    type Out = IoxOutbox<VehicleCommand>;
+    type In = IoxInbox<VehicleCommand>;
+
+    fn open(senders: usize, receivers: usize) -> Iceoryx2 {
+        let run: RunName = unique_name("conf").parse().unwrap();
+        let space = RunSpace::enter(&run).unwrap();
+        let limits = ServiceLimits { publishers: senders, subscribers: receivers, nodes: 1 };
+        let service = space.create(SERVICE, limits).unwrap();
+        Iceoryx2 {
+            outboxes: (0..senders).map(|_| service.outbox(EXPECTED).unwrap()).collect(),
+            inboxes: (0..receivers).map(|_| service.inbox().unwrap()).collect(),
+            _service: service,
+            _space: space,
+        }
+    }
+
+    fn ends(&mut self) -> (&mut [Self::Out], &mut [Self::In]) {
+        (&mut self.outboxes, &mut self.inboxes)
+    }
+}
+
+/// A header of which every field is different, for a step.
+fn header(step: u64) -> FrameHeader {
+    FrameHeader {
+        run_id: 0x1111 + step,
+        schema_hash: schema_hash(),
+        step,
+        time_ns: 3 * step,
+        coordinators_acting: 5 * step,
+        coordinators_summarised: 7 * step,
+        sender_role: 3,
+        sender_index: 11,
+        generation: 13,
+        record_count: 9999, // set by the outbox
+        flags: 17,
+    }
+}
+
+/// A record that can be told from every other.
+fn record(step: u64, i: usize) -> VehicleCommand {
+    VehicleCommand { u_mps2: step as f64, vehicle: i as u32, ..VehicleCommand::default() }
+}
+
+fn write<O: Outbox<VehicleCommand>>(
+    outbox: &mut O,
+    step: u64,
+    count: usize,
+) -> Result<O::Loan<'_>, TransportError> {
+    outbox.loan(header(step), count, |slots| (0..count).for_each(|i| slots.push(record(step, i))))
+}
+
+fn send<O: Outbox<VehicleCommand>>(outbox: &mut O, step: u64, count: usize) -> Result<usize, TransportError> {
+    write(outbox, step, count)?.send()
+}
+
+fn receive<I: Inbox<VehicleCommand>>(inbox: &mut I) -> Option<I::Frame> {
+    inbox.receive().unwrap()
+}
+
+/// Checks that a frame is exactly what was sent.
+fn check<F: Frame<VehicleCommand>>(frame: &F, step: u64, count: usize) {
+    assert_eq!(*frame.header(), FrameHeader { record_count: count as u32, ..header(step) });
+    let expected: Vec<_> = (0..count).map(|i| record(step, i)).collect();
+    assert_eq!(frame.records(), expected);
+}
+
+fn nothing_comes_before_anything_is_sent<B: Bench>() {
+    let mut bench = B::open(1, 2);
+    let (_, inboxes) = bench.ends();
+    assert!(inboxes.iter_mut().all(|inbox| receive(inbox).is_none()));
+}
+
+fn every_receiver_gets_every_frame_in_order<B: Bench>() {
+    let mut bench = B::open(1, 2);
+    let (outboxes, inboxes) = bench.ends();
+    for step in (0..200).step_by(2) {
+        for step in [step, step + 1] {
+            assert_eq!(send(&mut outboxes[0], step, 3), Ok(2), "the number of receivers");
+        }
+        for inbox in inboxes.iter_mut() {
+            for step in [step, step + 1] {
+                check(&receive(inbox).unwrap(), step, 3);
+            }
+            assert!(receive(inbox).is_none());
+        }
+    }
+}
+
+fn a_loan_shows_its_records_before_it_is_sent<B: Bench>() {
+    let mut bench = B::open(1, 1);
+    let (outboxes, inboxes) = bench.ends();
+    let loan = write(&mut outboxes[0], 1, 3).unwrap();
+    assert_eq!(loan.records(), [record(1, 0), record(1, 1), record(1, 2)]);
+    assert!(receive(&mut inboxes[0]).is_none(), "it has not been sent");
+    loan.send().unwrap();
+    check(&receive(&mut inboxes[0]).unwrap(), 1, 3);
+}
+
+fn a_frame_may_be_empty_and_may_grow<B: Bench>() {
+    let mut bench = B::open(1, 1);
+    let (outboxes, inboxes) = bench.ends();
+    // Far beyond what was expected, and back again.
+    let counts = [0, 1, EXPECTED, EXPECTED + 1, 0, 100, 3, 5000, 4999, 20_000, 0, 1];
+    for (step, count) in (0..).zip(counts) {
+        send(&mut outboxes[0], step, count).unwrap();
+        check(&receive(&mut inboxes[0]).unwrap(), step, count);
+    }
+}
+
+fn frames_in_flight_survive_growth<B: Bench>() {
+    let mut bench = B::open(1, 1);
+    let (outboxes, inboxes) = bench.ends();
+    send(&mut outboxes[0], 1, 2).unwrap();
+    let held = receive(&mut inboxes[0]).unwrap();
+    send(&mut outboxes[0], 2, 2).unwrap();
+    // Memory is laid out anew while one frame is being read and another waits.
+    send(&mut outboxes[0], 3, 10_000).unwrap();
+    check(&held, 1, 2);
+    check(&receive(&mut inboxes[0]).unwrap(), 2, 2);
+    check(&receive(&mut inboxes[0]).unwrap(), 3, 10_000);
+    check(&held, 1, 2);
+}
+
+fn a_receiver_that_does_not_take_its_frames_is_an_error<B: Bench>() {
+    let mut bench = B::open(1, 2);
+    let (outboxes, inboxes) = bench.ends();
+    let (lazy, diligent) = inboxes.split_at_mut(1);
+    for step in 0..2 {
+        send(&mut outboxes[0], step, 1).unwrap();
+        check(&receive(&mut diligent[0]).unwrap(), step, 1);
+    }
+    let error = send(&mut outboxes[0], 2, 1).unwrap_err();
+    assert_eq!(error, TransportError::ReceiverFull { service: SERVICE.to_owned() });
+    assert!(error.to_string().contains(SERVICE), "{error}");
+    // Nothing it had has been overwritten.
+    check(&receive(&mut lazy[0]).unwrap(), 0, 1);
+    check(&receive(&mut lazy[0]).unwrap(), 1, 1);
+    assert!(receive(&mut lazy[0]).is_none());
+    // Whether the diligent one got it is the transport's business; the run is over anyway.
+    while receive(&mut diligent[0]).is_some() {}
+    assert_eq!(send(&mut outboxes[0], 3, 1), Ok(2), "there is room again");
+    check(&receive(&mut lazy[0]).unwrap(), 3, 1);
+}
+
+fn the_room_is_per_sender<B: Bench>() {
+    const SENDERS: usize = 5;
+    let mut bench = B::open(SENDERS, 1);
+    let (outboxes, inboxes) = bench.ends();
+    for step in 0..2 {
+        for (i, outbox) in outboxes.iter_mut().enumerate() {
+            send(outbox, step, i).unwrap();
+        }
+    }
+    assert!(send(&mut outboxes[0], 2, 0).is_err());
+    // From each sender in order; between senders there is no order.
+    let mut next = [0; SENDERS];
+    while let Some(frame) = receive(&mut inboxes[0]) {
+        let sender = frame.records().len();
+        check(&frame, next[sender], sender);
+        next[sender] += 1;
+    }
+    assert_eq!(next, [2; SENDERS]);
+}
+
+fn a_loan_dropped_is_never_seen<B: Bench>() {
+    let mut bench = B::open(1, 1);
+    let (outboxes, inboxes) = bench.ends();
+    // Often enough to use up every loan if one were lost.
+    for step in 0..50 {
+        drop(write(&mut outboxes[0], 1000 + step, 2).unwrap());
+        assert!(receive(&mut inboxes[0]).is_none());
+        send(&mut outboxes[0], step, 2).unwrap();
+        check(&receive(&mut inboxes[0]).unwrap(), step, 2);
+    }
+}
+
+fn a_frame_half_written_is_never_seen<B: Bench>() {
+    let mut bench = B::open(1, 1);
+    let (outboxes, inboxes) = bench.ends();
+    for written in [0, 1, 3] {
+        let result = catch_unwind(AssertUnwindSafe(|| {
+            let loan = outboxes[0].loan(header(1), 2, |slots| {
+                (0..written).for_each(|i| slots.push(record(1, i)));
+            });
+            loan.map(drop)
+        }));
+        assert!(result.is_err(), "{written} records of 2 are a mistake in the program");
+        assert!(receive(&mut inboxes[0]).is_none());
+    }
+    send(&mut outboxes[0], 2, 2).unwrap();
+    check(&receive(&mut inboxes[0]).unwrap(), 2, 2);
+}
+
+fn frames_stay_as_they_are_while_held<B: Bench>() {
+    let mut bench = B::open(1, 2);
+    let (outboxes, inboxes) = bench.ends();
+    let (holder, passer) = inboxes.split_at_mut(1);
+    send(&mut outboxes[0], 0, 3).unwrap();
+    let mut held = receive(&mut holder[0]).unwrap();
+    drop(receive(&mut passer[0]));
+    for step in 1..100 {
+        send(&mut outboxes[0], step, 3).unwrap();
+        drop(receive(&mut passer[0]));
+        check(&held, step - 1, 3);
+        let next = receive(&mut holder[0]).unwrap();
+        check(&next, step, 3);
+        check(&held, step - 1, 3);
+        held = next;
+    }
+}
+
+macro_rules! conformance {
+    ($($test:ident),* $(,)?) => {
+        mod memory {
+            $(#[test] fn $test() { super::$test::<super::Memory>() })*
+        }
+        mod iceoryx2 {
+            $(#[test] fn $test() { super::$test::<super::Iceoryx2>() })*
+        }
+    };
+}
+
+conformance!(
+    nothing_comes_before_anything_is_sent,
+    every_receiver_gets_every_frame_in_order,
+    a_loan_shows_its_records_before_it_is_sent,
+    a_frame_may_be_empty_and_may_grow,
+    frames_in_flight_survive_growth,
+    a_receiver_that_does_not_take_its_frames_is_an_error,
+    the_room_is_per_sender,
+    a_loan_dropped_is_never_seen,
+    a_frame_half_written_is_never_seen,
+    frames_stay_as_they_are_while_held,
+);
+
+#[test]
+fn the_space_of_the_last_to_leave_is_empty() {
+    let name = unique_name("space");
+    let run: RunName = name.parse().unwrap();
+    let space = RunSpace::enter(&run).unwrap();
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
+    let service = space.create::<VehicleCommand>(SERVICE, limits).unwrap();
+    let other = RunSpace::enter(&run).unwrap();
+    let opened = other.open::<VehicleCommand>(SERVICE).unwrap();
+    let (mut outbox, mut inbox) = (opened.outbox(EXPECTED).unwrap(), service.inbox().unwrap());
+    send(&mut outbox, 1, 1).unwrap();
+    check(&receive(&mut inbox).unwrap(), 1, 1);
+    assert!(!RunSpace::sweep(&run).unwrap(), "a run that is alive is left alone");
+    send(&mut outbox, 2, 1).unwrap();
+    check(&receive(&mut inbox).unwrap(), 2, 1);
+    drop((inbox, service, space));
+    assert_ne!(common::files(None, &name), Vec::<std::path::PathBuf>::new());
+    drop((outbox, opened, other));
+    assert_eq!(common::files(None, &name), Vec::<std::path::PathBuf>::new());
+    assert!(RunSpace::sweep(&run).unwrap());
+}
