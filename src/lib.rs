@@ -4,6 +4,7 @@
 pub mod control;
 pub mod coordination;
 pub mod lockstep;
+pub mod reproduce;
 pub mod scenario;
 pub mod transport;
 pub mod vehicle;

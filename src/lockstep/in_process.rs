@@ -97,6 +97,11 @@ impl InProcess {
         self.world.world()
     }
 
+    /// Makes the world keep completed visits (see [`World::record_visits`]).
+    pub fn record_visits(&mut self) {
+        self.world.record_visits();
+    }
+
     /// Runs one step; `false` once the run is over.
     ///
     /// # Panics

@@ -63,6 +63,11 @@ where
         &self.world
     }
 
+    /// Makes the world keep completed visits (see [`World::record_visits`]).
+    pub fn record_visits(&mut self) {
+        self.world.record_visits();
+    }
+
     /// Does what can be done now.
     pub fn advance(&mut self) -> Result<Progress, LockstepError> {
         match self.phase {

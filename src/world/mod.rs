@@ -7,5 +7,5 @@ mod link;
 mod metrics;
 mod world;
 
-pub use metrics::{WorldSummary, ZoneSummaryRow};
+pub use metrics::{CompletedVisit, WorldSummary, ZoneSummaryRow};
 pub use world::{CommandFault, CoordinatorMasks, World};
