@@ -350,9 +350,11 @@ impl Claim {
         policies.into_iter().map(|p| replicate.run(self.traffic, p)).collect()
     }
 
-    /// The effect on a replicate whose runs have been performed; `None` where it is not defined.
+    /// The effect on a replicate whose runs have been performed; `None` where it is not defined, for one
+    /// because a run ended in a jam.
     pub fn effect(&self, runs: &Runs, replicate: &Replicate<'_>, speeds: &[f64]) -> Option<f64> {
-        (self.effect)(&Look { runs, replicate, traffic: self.traffic, speeds })
+        let complete = self.runs(replicate, speeds).iter().all(|run| runs.outcome(run).complete);
+        complete.then(|| (self.effect)(&Look { runs, replicate, traffic: self.traffic, speeds }))?
     }
 }
 

@@ -151,9 +151,10 @@ pub fn report(report: &Report) -> String {
     if !report.optimality.is_empty() {
         out.push_str(
             "## Optimality\n\nProblem 1 by direct transcription, solved by Clarabel; nothing of the \
-             analytic solution enters. Small negative values are the solver's tolerance. Where the leader \
-             is in the way (negative margin) the reference is not feasible and may cost less; the OCBF \
-             column then is what the controller pays on top of the constrained optimum.\n\n",
+             analytic solution enters. Where the leader is in the way (negative margin) the reference is not \
+             feasible and may cost less. The OCBF column is the cost of the controller as driven: it may \
+             be below the optimum where it misses the terminal speed, which the transcription must meet \
+             exactly; with a free terminal speed it is what tracking and the barrier rows cost.\n\n",
         );
         section(&mut out, &optimality::grids(&report.optimality));
         section(&mut out, &[optimality_summary(report)]);

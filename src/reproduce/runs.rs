@@ -5,10 +5,12 @@
 //! read in a fixed order: neither the number of threads nor their timing can show in a report.
 
 use super::ReproduceError;
+use crate::lockstep::LockstepError;
 use crate::lockstep::in_process::InProcess;
-use crate::scenario::{self, Override};
+use crate::scenario::{self, Override, Scenario};
 use crate::world::{CompletedVisit, ZoneSummaryRow};
 use crossbeam::channel;
+use ipc_schemas::STATE_LEFT;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
@@ -35,10 +37,18 @@ impl Run {
         let scenario = Arc::new(scenario::load_embedded(self.scenario, &overrides, Some(self.seed))?);
         let mut run = InProcess::new(&scenario, 1, 1);
         run.record_visits();
-        run.run()
-            .map_err(|error| ReproduceError::Run { command: self.command(), error: error.to_string() })?;
+        let failed =
+            |error: LockstepError| ReproduceError::Run { command: self.command(), error: error.to_string() };
+        let complete = drive(&mut run, &scenario).map_err(failed)?;
         let world = run.world();
-        let zones = world.summary().zones;
+        let mut zones = world.summary().zones;
+        if !complete {
+            // Means over those that got through would flatter a jam.
+            for zone in &mut zones {
+                (zone.mean_time_s, zone.mean_energy) = (f64::NAN, f64::NAN);
+                (zone.mean_objective, zone.fe_mean_s) = (f64::NAN, f64::NAN);
+            }
+        }
         let visits = world.visits();
         let exit_speeds_mps = (0..zones.len() as u32)
             .map(|zone| {
@@ -52,9 +62,39 @@ impl Run {
             .collect();
         // Only the figure over time looks at single vehicles.
         let visits = if self.scenario == VARYING_SCENARIO { visits.to_vec() } else { Vec::new() };
-        Ok(Outcome { beta: scenario.beta, zones, exit_speeds_mps, visits })
+        Ok(Outcome { beta: scenario.beta, complete, zones, exit_speeds_mps, visits })
     }
 }
+
+/// Runs to the end, or until a zone is jammed; whether every vehicle got through.
+fn drive(run: &mut InProcess, scenario: &Scenario) -> Result<bool, LockstepError> {
+    let window = ((JAM_S / scenario.dt_s()).ceil() as u64).max(1);
+    let zones = scenario.network.zones.len();
+    // Per zone: whether it had vehicles, and how many had left it, when the window began.
+    let mut before = vec![(false, 0); zones];
+    while run.step()? {
+        let world = run.world();
+        if !world.step().is_multiple_of(window) {
+            continue;
+        }
+        let mut now: Vec<(bool, u32)> = world.summary().zones.iter().map(|z| (false, z.vehicles)).collect();
+        for record in world.records().filter(|r| r.flags & STATE_LEFT == 0) {
+            if let Some((occupied, _)) = now.get_mut(record.zone as usize) {
+                *occupied = true;
+            }
+        }
+        if before.iter().zip(&now).any(|(before, now)| before.0 && before.1 == now.1) {
+            return Ok(false);
+        }
+        before = now;
+    }
+    let summary = run.world().summary();
+    Ok(summary.arrived == summary.departed && summary.waiting == 0)
+}
+
+/// A zone that nobody leaves for this long, s of simulated time, while a vehicle waits in it is jammed: a
+/// passage takes some 10 to 20 s.
+const JAM_S: f64 = 120.0;
 
 /// Scenario of the varying-traffic experiment; its runs keep single visits.
 pub const VARYING_SCENARIO: &str = "varying-demand";
@@ -64,6 +104,8 @@ pub const VARYING_SCENARIO: &str = "varying-demand";
 pub struct Outcome {
     /// Weight of time, m^2/s^4.
     pub beta: f64,
+    /// Whether every vehicle got through; the means are NaN when not.
+    pub complete: bool,
     /// Results per zone.
     pub zones: Vec<ZoneSummaryRow>,
     /// Mean speed at each zone's conflict point, m/s.

@@ -12,6 +12,7 @@ use super::paper::{COMPARISON, FEASIBILITY};
 use super::runs::{Progress, Run, Runs};
 use super::statistics::Interval;
 use serde::Serialize;
+use std::collections::BTreeSet;
 
 /// Replicates of the one-at-a-time part at most; `--seeds` may ask for fewer.
 const MOST_REPLICATES: u64 = 4;
@@ -115,6 +116,8 @@ pub struct SettingRow {
     pub level: String,
     /// `--set`s.
     pub sets: Vec<String>,
+    /// Runs in which traffic came to a standstill; claims that need one of them are undecided.
+    pub jammed: usize,
     /// Per claim.
     pub effects: Vec<SettingEffect>,
 }
@@ -174,6 +177,12 @@ pub fn analyse(
         choice,
         level: (*level).to_owned(),
         sets: sets.clone(),
+        jammed: needs(sets, replicates)
+            .into_iter()
+            .collect::<BTreeSet<Run>>()
+            .iter()
+            .filter(|run| !runs.outcome(run).complete)
+            .count(),
         effects: effects(runs, sets, replicates, &ours),
     };
     let settings: Vec<SettingRow> = named.iter().map(row).collect();
@@ -221,7 +230,7 @@ fn mark(verdict: Verdict) -> &'static str {
 }
 
 fn one_at_a_time_grid(settings: &[SettingRow], choices: &[Choice]) -> Grid {
-    let columns = ["choice", "level"].into_iter().chain(CLAIMS.iter().map(|c| c.id));
+    let columns = ["choice", "level", "jammed runs"].into_iter().chain(CLAIMS.iter().map(|c| c.id));
     let mut grid = Grid::new(
         "One at a time: effect and verdict of each claim (✓ holds, ~ in direction, ✗ does not hold, ? undecided; * moved)",
         columns,
@@ -234,7 +243,11 @@ fn one_at_a_time_grid(settings: &[SettingRow], choices: &[Choice]) -> Grid {
             let moved = if e.moves { " *" } else { "" };
             Entry::from(format!("{effect} {}{moved}", mark(e.verdict)))
         };
-        grid.row([setting.choice.into(), level.into()].into_iter().chain(setting.effects.iter().map(cell)));
+        grid.row(
+            [setting.choice.into(), level.into(), number(setting.jammed as f64, 0)]
+                .into_iter()
+                .chain(setting.effects.iter().map(cell)),
+        );
     }
     grid
 }
