@@ -148,6 +148,9 @@ pub struct Sensitivity {
     pub grids: Vec<Grid>,
 }
 
+/// A claim's effect, replicate by replicate.
+type PerReplicate = Vec<Option<f64>>;
+
 fn replicate(seed: u64, sets: &[String]) -> Replicate<'_> {
     Replicate { demand: Demand::Seeded, seed, sets }
 }
@@ -190,22 +193,22 @@ pub fn analyse(
     grids.push(design_grid(runs, &points, few));
     grids.push(solver_grid(runs));
 
-    let (sets, deviation, tried) = search(runs, few, progress)?;
+    let Found { sets, deviation, tried } = search(runs, few, progress)?;
     runs.perform(needs(&sets, replicates), progress)?;
     let closest = Closest { effects: effects(runs, &sets, replicates, &ours), sets, deviation, tried };
     grids.extend(closest_grids(runs, &closest, few));
     Ok(Sensitivity { replicates, settings, closest, grids })
 }
 
-fn effects_by_replicate(runs: &Runs, sets: &[String], n: u64) -> Vec<Vec<Option<f64>>> {
+fn effects_by_replicate(runs: &Runs, sets: &[String], n: u64) -> Vec<PerReplicate> {
     let of =
         |claim: &Claim| (1..=n).map(|seed| claim.effect(runs, &replicate(seed, sets), &SPEEDS)).collect();
     CLAIMS.iter().map(of).collect()
 }
 
-fn effects(runs: &Runs, sets: &[String], n: u64, ours: &[Vec<Option<f64>>]) -> Vec<SettingEffect> {
+fn effects(runs: &Runs, sets: &[String], n: u64, ours: &[PerReplicate]) -> Vec<SettingEffect> {
     let here = effects_by_replicate(runs, sets, n);
-    let each = |((claim, here), ours): ((&Claim, Vec<Option<f64>>), &Vec<Option<f64>>)| {
+    let each = |((claim, here), ours): ((&Claim, PerReplicate), &PerReplicate)| {
         let effect = here.iter().copied().collect::<Option<Vec<f64>>>().and_then(|e| Interval::of(&e));
         let change: Option<Vec<f64>> = here.iter().zip(ours).map(|(a, b)| Some((*a)? - (*b)?)).collect();
         let change = change.and_then(|c| Interval::of(&c));
@@ -436,13 +439,16 @@ fn search_levels() -> Vec<Vec<Vec<String>>> {
     all
 }
 
+/// What the search found: see [`Closest`].
+struct Found {
+    sets: Vec<String>,
+    deviation: (f64, f64),
+    tried: usize,
+}
+
 /// Coordinate search within the bounds: each choice in turn takes its best level, until a whole pass
 /// changes nothing or two have been made.
-fn search(
-    runs: &mut Runs,
-    n: u64,
-    progress: &mut Progress<'_>,
-) -> Result<(Vec<String>, (f64, f64), usize), ReproduceError> {
+fn search(runs: &mut Runs, n: u64, progress: &mut Progress<'_>) -> Result<Found, ReproduceError> {
     let levels = search_levels();
     let mut at = vec![0; levels.len()];
     let sets = |at: &[usize]| -> Vec<String> {
@@ -474,7 +480,7 @@ fn search(
             break;
         }
     }
-    Ok((sets(&at), (start, best), tried))
+    Ok(Found { sets: sets(&at), deviation: (start, best), tried })
 }
 
 fn closest_grids(runs: &Runs, closest: &Closest, n: u64) -> Vec<Grid> {
