@@ -1,1 +1,7 @@
-fn main() {}
+//! A vehicle-controller pool of a run.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    control_zones::app::cz_ctrl()
+}

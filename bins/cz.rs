@@ -1,1 +1,7 @@
-fn main() {}
+//! The `cz` program: run, plan, and the parts of a run.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    control_zones::app::cz()
+}

@@ -1,9 +1,13 @@
 //! Control Zones: safe, optimal coordination of connected automated vehicles through networks of
 //! control zones, as a lockstep multi-process runtime.
 
+pub mod app;
+pub mod bench;
 pub mod control;
 pub mod coordination;
+pub mod encoding;
 pub mod lockstep;
+pub mod process;
 pub mod reproduce;
 pub mod scenario;
 pub mod transport;

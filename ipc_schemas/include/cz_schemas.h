@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0xeaf7954ac66f38b2)
+#define CZ_SCHEMA_HASH UINT64_C(0x2a0cc8c48918c06b)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -92,6 +92,12 @@
 /** `cz_attach_request_t.phase`: has been admitted, has opened its ends of the services, and can
  *  start. */
 #define CZ_ATTACH_READY UINT32_C(2)
+/** `cz_attach_reply_t.waiting`: hot processes poll, coordinators sleep. */
+#define CZ_WAITING_HYBRID UINT32_C(0)
+/** `cz_attach_reply_t.waiting`: everyone spins. */
+#define CZ_WAITING_SPIN UINT32_C(1)
+/** `cz_attach_reply_t.waiting`: everyone sleeps until rung. */
+#define CZ_WAITING_BLOCK UINT32_C(2)
 /** `cz_attach_reply_t.status`: welcome; the other fields and the scenario bytes are valid. */
 #define CZ_ATTACH_ACCEPTED UINT32_C(0)
 /** `cz_attach_reply_t.status`: the participant's schema hash is not the world's. */
@@ -105,7 +111,8 @@
 
 /** World -> controllers: `cz_vehicle_state_t` of every step. */
 #define CZ_SERVICE_STATE "cz/state"
-/** World -> coordinator `i`: `cz_vehicle_state_t`, only of the steps it acts in; `i` is appended. */
+/** World -> coordinator `i`: `cz_vehicle_state_t`, only of the steps it acts in and only of its
+ *  zones that act; `i` is appended. */
 #define CZ_SERVICE_COORDINATOR_STATE_PREFIX "cz/coordinator-state/"
 /** Coordinators -> controllers: `cz_assignment_t` of the steps they act in. */
 #define CZ_SERVICE_COORDINATION "cz/coordination"
@@ -113,6 +120,13 @@
 #define CZ_SERVICE_SUMMARY_PREFIX "cz/summary/"
 /** Controllers -> world: `cz_vehicle_command_t` of every step. */
 #define CZ_SERVICE_COMMAND "cz/command"
+/** Bell of the world, rung by controllers when everyone blocks. */
+#define CZ_BELL_WORLD "cz/bell/world"
+/** Bell of coordinator `i`; `i` is appended. */
+#define CZ_BELL_COORDINATOR_PREFIX "cz/bell/coordinator/"
+/** Bell of controller `i`, rung by the world and coordinators when everyone blocks; `i` is
+ *  appended. */
+#define CZ_BELL_CONTROLLER_PREFIX "cz/bell/controller/"
 /** Participants -> world: `cz_attach_request_t`. */
 #define CZ_SERVICE_ATTACH "cz/attach"
 /** World -> participants: the scenario as bytes, behind the `cz_attach_reply_t`. */
@@ -398,8 +412,13 @@ typedef struct cz_attach_reply {
     uint32_t coordinators;
     /** Number of controller processes in the run. */
     uint32_t controllers;
+    /** How the processes of the run wait: 0 hybrid, 1 spin, 2 block. When they block, whoever sends
+     *  a frame rings its receivers' bells; in hybrid, only coordinators have bells. */
+    uint32_t waiting;
+    /** Zero. */
+    uint32_t reserved;
 } cz_attach_reply_t;
-CZ_ASSERT_(attach_reply_size, sizeof(cz_attach_reply_t) == 64);
+CZ_ASSERT_(attach_reply_size, sizeof(cz_attach_reply_t) == 72);
 CZ_ASSERT_ALIGN_(cz_attach_reply_t, 8);
 CZ_ASSERT_(attach_reply_instance_offset, offsetof(cz_attach_reply_t, instance) == 0);
 CZ_ASSERT_(attach_reply_run_id_offset, offsetof(cz_attach_reply_t, run_id) == 8);
@@ -412,6 +431,8 @@ CZ_ASSERT_(attach_reply_generation_offset, offsetof(cz_attach_reply_t, generatio
 CZ_ASSERT_(attach_reply_index_offset, offsetof(cz_attach_reply_t, index) == 52);
 CZ_ASSERT_(attach_reply_coordinators_offset, offsetof(cz_attach_reply_t, coordinators) == 56);
 CZ_ASSERT_(attach_reply_controllers_offset, offsetof(cz_attach_reply_t, controllers) == 60);
+CZ_ASSERT_(attach_reply_waiting_offset, offsetof(cz_attach_reply_t, waiting) == 64);
+CZ_ASSERT_(attach_reply_reserved_offset, offsetof(cz_attach_reply_t, reserved) == 68);
 
 #undef CZ_ASSERT_
 #undef CZ_ASSERT_ALIGN_

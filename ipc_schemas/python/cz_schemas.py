@@ -11,7 +11,7 @@ import ctypes
 import sys
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0xeaf7954ac66f38b2
+SCHEMA_HASH = 0x2a0cc8c48918c06b
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -69,6 +69,12 @@ ANY_SCENARIO = 0
 ATTACH_JOIN = 1
 #: `AttachRequest.phase`: has been admitted, has opened its ends of the services, and can start.
 ATTACH_READY = 2
+#: `AttachReply.waiting`: hot processes poll, coordinators sleep.
+WAITING_HYBRID = 0
+#: `AttachReply.waiting`: everyone spins.
+WAITING_SPIN = 1
+#: `AttachReply.waiting`: everyone sleeps until rung.
+WAITING_BLOCK = 2
 #: `AttachReply.status`: welcome; the other fields and the scenario bytes are valid.
 ATTACH_ACCEPTED = 0
 #: `AttachReply.status`: the participant's schema hash is not the world's.
@@ -82,7 +88,8 @@ ATTACH_BAD_ROLE = 4
 
 #: World → controllers: `VehicleState` of every step.
 SERVICE_STATE = "cz/state"
-#: World → coordinator `i`: `VehicleState`, only of the steps it acts in; `i` is appended.
+#: World → coordinator `i`: `VehicleState`, only of the steps it acts in and only of its zones that
+#: act; `i` is appended.
 SERVICE_COORDINATOR_STATE_PREFIX = "cz/coordinator-state/"
 #: Coordinators → controllers: `Assignment` of the steps they act in.
 SERVICE_COORDINATION = "cz/coordination"
@@ -90,6 +97,12 @@ SERVICE_COORDINATION = "cz/coordination"
 SERVICE_SUMMARY_PREFIX = "cz/summary/"
 #: Controllers → world: `VehicleCommand` of every step.
 SERVICE_COMMAND = "cz/command"
+#: Bell of the world, rung by controllers when everyone blocks.
+BELL_WORLD = "cz/bell/world"
+#: Bell of coordinator `i`; `i` is appended.
+BELL_COORDINATOR_PREFIX = "cz/bell/coordinator/"
+#: Bell of controller `i`, rung by the world and coordinators when everyone blocks; `i` is appended.
+BELL_CONTROLLER_PREFIX = "cz/bell/controller/"
 #: Participants → world: `AttachRequest`.
 SERVICE_ATTACH = "cz/attach"
 #: World → participants: the scenario as bytes, behind the `AttachReply`.
@@ -355,6 +368,10 @@ class AttachReply(ctypes.Structure):
         index: Index assigned among the processes of the role.
         coordinators: Number of coordinator processes in the run.
         controllers: Number of controller processes in the run.
+        waiting: How the processes of the run wait: 0 hybrid, 1 spin, 2 block. When they block,
+            whoever sends a frame rings its receivers' bells; in hybrid, only coordinators have
+            bells.
+        reserved: Zero.
     """
 
     _fields_ = [
@@ -369,6 +386,8 @@ class AttachReply(ctypes.Structure):
         ("index", ctypes.c_uint32),
         ("coordinators", ctypes.c_uint32),
         ("controllers", ctypes.c_uint32),
+        ("waiting", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
     ]
 
     @staticmethod
@@ -499,7 +518,7 @@ _LAYOUTS = {
         },
     ),
     AttachReply: (
-        64,
+        72,
         8,
         {
             "instance": 0,
@@ -513,6 +532,8 @@ _LAYOUTS = {
             "index": 52,
             "coordinators": 56,
             "controllers": 60,
+            "waiting": 64,
+            "reserved": 68,
         },
     ),
 }

@@ -16,6 +16,13 @@ codes! {
     /// [`AttachRequest::phase`]: has been admitted, has opened its ends of the services, and can start.
     pub const ATTACH_READY: u32 = 2;
 
+    /// [`AttachReply::waiting`]: hot processes poll, coordinators sleep.
+    pub const WAITING_HYBRID: u32 = 0;
+    /// [`AttachReply::waiting`]: everyone spins.
+    pub const WAITING_SPIN: u32 = 1;
+    /// [`AttachReply::waiting`]: everyone sleeps until rung.
+    pub const WAITING_BLOCK: u32 = 2;
+
     /// [`AttachReply::status`]: welcome; the other fields and the scenario bytes are valid.
     pub const ATTACH_ACCEPTED: u32 = 0;
     /// [`AttachReply::status`]: the participant's schema hash is not the world's.
@@ -81,5 +88,10 @@ record! {
         pub coordinators: u32,
         /// Number of controller processes in the run.
         pub controllers: u32,
+        /// How the processes of the run wait: 0 hybrid, 1 spin, 2 block. When they block, whoever sends a
+        /// frame rings its receivers' bells; in hybrid, only coordinators have bells.
+        pub waiting: u32,
+        /// Zero.
+        pub reserved: u32,
     }
 }

@@ -121,6 +121,7 @@ macro_rules! record {
         #[derive(
             Clone, Copy, Debug, Default, PartialEq,
             iceoryx2_bb_derive_macros::ZeroCopySend,
+            serde::Serialize, serde::Deserialize,
         )]
         #[type_name($type_name)]
         pub struct $name {

@@ -5,8 +5,8 @@ use crate::code::codes;
 codes! {
     /// World → controllers: [`VehicleState`](crate::VehicleState) of every step.
     pub const SERVICE_STATE: &str = "cz/state";
-    /// World → coordinator `i`: [`VehicleState`](crate::VehicleState), only of the steps it acts in; `i`
-    /// is appended.
+    /// World → coordinator `i`: [`VehicleState`](crate::VehicleState), only of the steps it acts in and
+    /// only of its zones that act; `i` is appended.
     pub const SERVICE_COORDINATOR_STATE_PREFIX: &str = "cz/coordinator-state/";
     /// Coordinators → controllers: [`Assignment`](crate::Assignment) of the steps they act in.
     pub const SERVICE_COORDINATION: &str = "cz/coordination";
@@ -14,6 +14,12 @@ codes! {
     pub const SERVICE_SUMMARY_PREFIX: &str = "cz/summary/";
     /// Controllers → world: [`VehicleCommand`](crate::VehicleCommand) of every step.
     pub const SERVICE_COMMAND: &str = "cz/command";
+    /// Bell of the world, rung by controllers when everyone blocks.
+    pub const BELL_WORLD: &str = "cz/bell/world";
+    /// Bell of coordinator `i`; `i` is appended.
+    pub const BELL_COORDINATOR_PREFIX: &str = "cz/bell/coordinator/";
+    /// Bell of controller `i`, rung by the world and coordinators when everyone blocks; `i` is appended.
+    pub const BELL_CONTROLLER_PREFIX: &str = "cz/bell/controller/";
     /// Participants → world: [`AttachRequest`](crate::AttachRequest).
     pub const SERVICE_ATTACH: &str = "cz/attach";
     /// World → participants: the scenario as bytes, behind the [`AttachReply`](crate::AttachReply).

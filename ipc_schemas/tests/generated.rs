@@ -116,7 +116,7 @@ const GOLDEN: [Golden; 7] = [
     ),
     (
         "cz.AttachReply.v1",
-        64,
+        72,
         &[
             ("instance", "u64", 0),
             ("run_id", "u64", 8),
@@ -129,12 +129,14 @@ const GOLDEN: [Golden; 7] = [
             ("index", "u32", 52),
             ("coordinators", "u32", 56),
             ("controllers", "u32", 60),
+            ("waiting", "u32", 64),
+            ("reserved", "u32", 68),
         ],
     ),
 ];
 
 /// XXH3-64 of the schema text of [`GOLDEN`].
-const GOLDEN_HASH: u64 = 0xeaf7_954a_c66f_38b2;
+const GOLDEN_HASH: u64 = 0x2a0c_c8c4_8918_c06b;
 
 fn crate_dir() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

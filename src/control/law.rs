@@ -96,6 +96,15 @@ pub struct Decision {
     pub verdict: Verdict,
 }
 
+/// One step's quadratic program, its rows already reduced.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Program {
+    /// Objective.
+    pub tracking: Tracking,
+    /// Feasible accelerations.
+    pub interval: Interval,
+}
+
 /// The law with its parameters.
 #[derive(Clone, Debug)]
 pub struct Law {
@@ -134,32 +143,14 @@ impl Law {
     where
         P: Iterator<Item = Partner> + Clone,
     {
-        if memory.mode == Mode::Fe {
-            let may_brake = s.x_m <= self.control.fe_fraction * s.length_m;
-            if may_brake && !self.entry_conditions_hold(s, partners.clone()) {
-                return Decision { u_mps2: self.vehicle.u_min_mps2, verdict: Verdict::Fe };
-            }
-            memory.mode = Mode::Ocbf;
-        }
-        let plan = self.plan(s, memory);
-        let (v_ref, u_ref) = plan.at(self.control.position_feedback, s.time_s, s.x_m);
-        let tracking = Tracking {
-            u_ref_mps2: u_ref,
-            error_mps: s.v_mps - v_ref,
-            clf_rate_per_s: self.control.clf_rate_per_s,
-            slack_weight: self.slack_weight,
+        let Some(Program { tracking, interval }) = self.program(s, partners.clone(), memory) else {
+            return Decision { u_mps2: self.vehicle.u_min_mps2, verdict: Verdict::Fe };
         };
-        let mut interval = Interval::limits(self.vehicle.u_min_mps2, self.vehicle.u_max_mps2);
-        self.rows(s, partners.clone(), &mut interval);
         let u = match self.control.solver {
             Solver::ClosedForm => qp::solve(&tracking, &interval),
             Solver::Clarabel => {
-                let mut rows: Vec<(Inequality, Row)> = Vec::with_capacity(12);
-                rows.at_least(self.vehicle.u_min_mps2, Row::UMin);
-                rows.at_most(Inequality { coefficient: 1.0, bound: self.vehicle.u_max_mps2 }, Row::UMax);
-                self.rows(s, partners, &mut rows);
                 // The limits once more, so that an answer within the solver's tolerance obeys them.
-                clarabel::solve(&tracking, &rows)
+                clarabel::solve(&tracking, &self.row_list(s, partners))
                     .map(|u| u.clamp(self.vehicle.u_min_mps2, self.vehicle.u_max_mps2))
             }
         };
@@ -177,6 +168,44 @@ impl Law {
                 Decision { u_mps2: u, verdict }
             }
         }
+    }
+
+    /// The program of `equ:ocbf_qp` for this step; `None` in FE mode, which does not solve one.
+    pub fn program<P>(&self, s: &Situation, partners: P, memory: &mut Memory) -> Option<Program>
+    where
+        P: Iterator<Item = Partner> + Clone,
+    {
+        if memory.mode == Mode::Fe {
+            let may_brake = s.x_m <= self.control.fe_fraction * s.length_m;
+            if may_brake && !self.entry_conditions_hold(s, partners.clone()) {
+                return None;
+            }
+            memory.mode = Mode::Ocbf;
+        }
+        let plan = self.plan(s, memory);
+        let (v_ref, u_ref) = plan.at(self.control.position_feedback, s.time_s, s.x_m);
+        let tracking = Tracking {
+            u_ref_mps2: u_ref,
+            error_mps: s.v_mps - v_ref,
+            clf_rate_per_s: self.control.clf_rate_per_s,
+            slack_weight: self.slack_weight,
+        };
+        let mut interval = Interval::limits(self.vehicle.u_min_mps2, self.vehicle.u_max_mps2);
+        self.rows(s, partners, &mut interval);
+        Some(Program { tracking, interval })
+    }
+
+    /// All rows, one by one, limits included, as a general solver wants them.
+    pub fn row_list<P: Iterator<Item = Partner>>(
+        &self,
+        s: &Situation,
+        partners: P,
+    ) -> Vec<(Inequality, Row)> {
+        let mut rows: Vec<(Inequality, Row)> = Vec::with_capacity(12);
+        rows.at_least(self.vehicle.u_min_mps2, Row::UMin);
+        rows.at_most(Inequality { coefficient: 1.0, bound: self.vehicle.u_max_mps2 }, Row::UMax);
+        self.rows(s, partners, &mut rows);
+        rows
     }
 
     /// The plan in force: made when there is none, re-made when the terminal condition changed.
@@ -204,7 +233,7 @@ impl Law {
                 };
                 let optimum = match old {
                     Some(old) => problem.perturb(law, &old.optimum, old.terminal),
-                    None => problem.solve(law),
+                    None => problem.solve_forward(law),
                 };
                 Reference {
                     start_s: s.entry_time_s,
@@ -222,7 +251,7 @@ impl Law {
                     start_s: s.time_s,
                     origin_m: s.x_m,
                     v0_mps: s.v_mps,
-                    optimum: problem.solve(law),
+                    optimum: problem.solve_forward(law),
                     terminal: s.terminal,
                 }
             }

@@ -1,8 +1,10 @@
 //! The controller role: the vehicles of some zones, from state and coordination frames to commands.
 
-use super::law::{Law, Memory, Mode, Partner, PartnerKind, Situation, Verdict};
+use super::law::{Law, Memory, Mode, Partner, PartnerKind, Program, Situation, Verdict};
 use super::reference::{Reference, Terminal};
+use super::rows::Row;
 use crate::scenario::{Scenario, ZoneId};
+use crate::vehicle::Inequality;
 use ipc_schemas::{self as frames, Assignment, VehicleCommand, VehicleState};
 use std::ops::Range;
 use std::sync::Arc;
@@ -44,6 +46,30 @@ struct Constraint {
     /// Added to the partner's position to express it in the vehicle's coordinate, m.
     shift_m: f64,
     conflict_m: f64,
+}
+
+/// The partners of one vehicle, looked up in its zone's slice of the state frame.
+#[derive(Clone, Debug)]
+struct Partners<'a> {
+    constraints: std::slice::Iter<'a, Constraint>,
+    slice: &'a [VehicleState],
+}
+
+impl Iterator for Partners<'_> {
+    type Item = Partner;
+
+    #[inline]
+    fn next(&mut self) -> Option<Partner> {
+        let c = self.constraints.next()?;
+        let partner = &self.slice[c.partner_at as usize];
+        Some(Partner {
+            kind: c.kind,
+            x_m: partner.x_m + c.shift_m,
+            v_mps: partner.v_mps,
+            u_mps2: partner.u_mps2,
+            conflict_m: c.conflict_m,
+        })
+    }
 }
 
 /// A frame that contradicts the protocol.
@@ -113,6 +139,34 @@ impl ControllerPool {
         states: &[VehicleState],
         mut emit: impl FnMut(VehicleCommand),
     ) -> Result<(), PoolError> {
+        self.visit(time_s, states, |law, state, situation, partners, memory| {
+            let decision = law.decide(situation, partners, memory);
+            emit(command(state, &decision, memory));
+        })
+    }
+
+    /// Shows every program the law would solve in this step, and changes nothing.
+    pub fn inspect(
+        &mut self,
+        time_s: f64,
+        states: &[VehicleState],
+        mut show: impl FnMut(&Program, Vec<(Inequality, Row)>),
+    ) -> Result<(), PoolError> {
+        self.visit(time_s, states, |law, _, situation, partners, memory| {
+            if let Some(program) = law.program(situation, partners.clone(), &mut memory.clone()) {
+                show(&program, law.row_list(situation, partners));
+            }
+        })
+    }
+
+    /// Calls `with` for each vehicle of the pool's zones, in frame order.
+    #[inline]
+    fn visit(
+        &mut self,
+        time_s: f64,
+        states: &[VehicleState],
+        mut with: impl FnMut(&Law, &VehicleState, &Situation, Partners<'_>, &mut Memory),
+    ) -> Result<(), PoolError> {
         let range = self.own_range(states);
         for slice in states[range].chunk_by(|a, b| a.zone == b.zone) {
             let zone = slice[0].zone;
@@ -142,18 +196,8 @@ impl ControllerPool {
                 };
                 let constraints =
                     &crew.constraints[member.first_constraint as usize..member.end_constraint as usize];
-                let partners = constraints.iter().map(|c| {
-                    let partner = &slice[c.partner_at as usize];
-                    Partner {
-                        kind: c.kind,
-                        x_m: partner.x_m + c.shift_m,
-                        v_mps: partner.v_mps,
-                        u_mps2: partner.u_mps2,
-                        conflict_m: c.conflict_m,
-                    }
-                });
-                let decision = self.law.decide(&situation, partners, &mut member.memory);
-                emit(command(state, &decision, &member.memory));
+                let partners = Partners { constraints: constraints.iter(), slice };
+                with(&self.law, state, &situation, partners, &mut member.memory);
             }
         }
         Ok(())
@@ -291,7 +335,7 @@ fn command(state: &VehicleState, decision: &super::Decision, memory: &Memory) ->
 /// The memory a command frame carries (the inverse of what [`ControllerPool::command`] writes).
 pub fn memory_of(command: &VehicleCommand) -> Memory {
     let mode = if command.mode == frames::MODE_OCBF { Mode::Ocbf } else { Mode::Fe };
-    let plan = (command.plan_duration_s > 0.0).then(|| Reference {
+    let plan = (command.plan_duration_s > 0.0).then_some(Reference {
         start_s: command.plan_start_s,
         origin_m: command.plan_origin_m,
         v0_mps: command.plan_v0_mps,

@@ -50,28 +50,46 @@ impl Problem {
     pub fn solve(&self, law: ReferenceLaw) -> Optimum {
         let duration_s = match law {
             ReferenceLaw::Corrected => {
-                self.quartic().least_cost_root(|t| self.coefficients(t).cost(self.beta))
+                let cost = |t: f64| self.coefficients(t).cost(self.beta);
+                match self.quartic().rising_roots() {
+                    RisingRoots { early: Some(early), late: Some(late) } if cost(late) < cost(early) => late,
+                    roots => roots.early.or(roots.late).expect(RISES),
+                }
             }
             ReferenceLaw::AsPrinted => self.printed_duration(),
         };
         self.coefficients(duration_s)
     }
 
+    /// The optimum a vehicle can drive.
+    ///
+    /// Where the cost has two minima, the later one overshoots the end and comes back. It can be the
+    /// cheaper of the two, but a vehicle does not reverse (`VehicleConstraints`), so the earlier is taken.
+    pub fn solve_forward(&self, law: ReferenceLaw) -> Optimum {
+        match law {
+            ReferenceLaw::Corrected => {
+                let roots = self.quartic().rising_roots();
+                self.coefficients(roots.early.or(roots.late).expect(RISES))
+            }
+            ReferenceLaw::AsPrinted => self.solve(law),
+        }
+    }
+
     /// Re-plans for another terminal speed by perturbing the duration of `old` (paper:
     /// `equ:delta_t`).
     ///
     /// Corrected: first-order step `-(g_w / g_T) dw`, polished by Newton when the residual asks for it,
-    /// solved afresh when the cost has two local minima. As printed: the printed first-order step alone.
+    /// solved afresh (see [`solve_forward`](Self::solve_forward)) when the cost has two local minima. As printed: the printed first-order step alone.
     pub fn perturb(&self, law: ReferenceLaw, old: &Optimum, old_terminal: Terminal) -> Optimum {
         let (Terminal::Speed(w_old), Terminal::Speed(w)) = (old_terminal, self.terminal) else {
-            return self.solve(law);
+            return self.solve_forward(law);
         };
         let (t, v0, l) = (old.duration_s, self.v0_mps, self.length_m);
         match law {
             ReferenceLaw::Corrected => {
                 let quartic = self.quartic();
                 if !quartic.is_monotone() {
-                    return self.solve(law);
+                    return self.solve_forward(law);
                 }
                 let before = Problem { terminal: old_terminal, ..*self }.quartic();
                 let g_w = -2.0 * (v0 + 2.0 * w_old) * t * t + 12.0 * l * t;
@@ -79,7 +97,7 @@ impl Problem {
                 let mut duration = t + step;
                 for _ in 0..8 {
                     if !(duration > 0.0 && duration.is_finite()) {
-                        return self.solve(law);
+                        return self.solve_forward(law);
                     }
                     let residual = quartic.value(duration);
                     if residual.abs() <= 1e-12 * quartic.s {
@@ -87,7 +105,7 @@ impl Problem {
                     }
                     duration -= residual / quartic.slope(duration);
                 }
-                self.solve(law)
+                self.solve_forward(law)
             }
             ReferenceLaw::AsPrinted => {
                 let numerator = t * t + 6.0 * v0 * t;
@@ -98,7 +116,7 @@ impl Problem {
                 if duration > 0.0 && duration.is_finite() {
                     self.coefficients(duration)
                 } else {
-                    self.solve(law)
+                    self.solve_forward(law)
                 }
             }
         }
@@ -213,31 +231,35 @@ impl Quartic {
         t
     }
 
-    /// The root at which the cost is least. Minima of the cost are the roots where the value rises.
-    fn least_cost_root(&self, cost: impl Fn(f64) -> f64) -> f64 {
+    /// The minima of the cost: the positive roots at which the value rises.
+    fn rising_roots(&self) -> RisingRoots {
         let value = |t: f64| self.value(t);
         let slope = |t: f64| self.slope(t);
         let high = self.beyond();
         if self.is_monotone() {
-            return rising_root(&value, &slope, 0.0, high);
+            return RisingRoots { early: Some(rising_root(&value, &slope, 0.0, high)), late: None };
         }
         // The value rises, falls and rises again; the slope has one root on each side of the inflection.
         let middle = self.inflection();
         let curvature = |t: f64| 12.0 * self.p * t * t - 2.0 * self.q;
         let top = falling_root(&slope, 0.0, middle);
         let bottom = rising_root(&slope, &curvature, middle, high);
-        let early = (value(top) >= 0.0).then(|| rising_root(&value, &slope, 0.0, top));
-        let late = (value(bottom) < 0.0).then(|| rising_root(&value, &slope, bottom, high));
-        match (early, late) {
-            (Some(e), Some(l)) if cost(l) < cost(e) => l,
-            (Some(e), _) => e,
-            (None, Some(l)) => l,
-            (None, None) => {
-                unreachable!("a quartic negative at 0 and positive at infinity has a rising root")
-            }
+        RisingRoots {
+            early: (value(top) >= 0.0).then(|| rising_root(&value, &slope, 0.0, top)),
+            late: (value(bottom) < 0.0).then(|| rising_root(&value, &slope, bottom, high)),
         }
     }
 }
+
+/// Minima of the cost over the duration, s. At least one exists.
+#[derive(Clone, Copy, Debug)]
+struct RisingRoots {
+    early: Option<f64>,
+    late: Option<f64>,
+}
+
+/// Why [`RisingRoots`] is never empty.
+const RISES: &str = "a quartic negative at 0 and positive at infinity has a rising root";
 
 /// The root in `[low, high]` of a function that is negative before and positive after it: Newton,
 /// kept inside a shrinking bracket.

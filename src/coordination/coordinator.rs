@@ -24,6 +24,8 @@ pub struct Coordinator {
     /// Summaries of this step to zones of other processes.
     external: Vec<ZoneSummary>,
     assignments: Vec<Assignment>,
+    /// Zones whose desk has been told something for this step.
+    told: Vec<ZoneId>,
 }
 
 /// What a coordinator keeps for one zone.
@@ -63,6 +65,7 @@ impl Coordinator {
             internal_step: 0,
             external: Vec::new(),
             assignments: Vec::new(),
+            told: Vec::new(),
             scenario,
         }
     }
@@ -75,6 +78,7 @@ impl Coordinator {
                 let downstream = self.scenario.network.downstream(summary.to_zone);
                 let desk = &mut self.desks[(summary.to_zone - self.zones.start) as usize];
                 desk.told = true;
+                self.told.push(summary.to_zone);
                 if downstream == Some(summary.from_zone) {
                     desk.downstream = Some(*summary);
                 }
@@ -82,7 +86,7 @@ impl Coordinator {
         }
     }
 
-    /// Acts on a state frame. Afterwards [`assignments`](Self::assignments) and
+    /// Acts on a state frame that holds at least the zones that act. Afterwards [`assignments`](Self::assignments) and
     /// [`summaries`](Self::summaries) hold what is to be sent. Returns whether a zone of this process had
     /// an event of its own, in which case every neighbouring process expects a summary frame.
     pub fn act(&mut self, step: u64, states: &[VehicleState]) -> bool {
@@ -96,11 +100,13 @@ impl Coordinator {
         self.internal_step = step;
         self.external.clear();
         self.assignments.clear();
-        for zone in self.zones.clone() {
-            let from = states.partition_point(|s| s.zone < zone);
-            let slice = &states[from..from + states[from..].partition_point(|s| s.zone == zone)];
+        for slice in states.chunk_by(|a, b| a.zone == b.zone) {
+            let zone = slice[0].zone;
+            if !self.zones.contains(&zone) {
+                continue;
+            }
             let desk = &mut self.desks[(zone - self.zones.start) as usize];
-            let told = std::mem::take(&mut desk.told);
+            let told = desk.told;
             let event = slice.iter().any(|s| s.flags & (STATE_ENTERED | STATE_LEFT_NOW) != 0);
             had_event |= event;
             if event {
@@ -118,6 +124,9 @@ impl Coordinator {
                 let zone = &self.scenario.network.zones[zone as usize];
                 partners::assign(zone, slice, terminal, &mut self.assignments);
             }
+        }
+        for zone in self.told.drain(..) {
+            self.desks[(zone - self.zones.start) as usize].told = false;
         }
         had_event
     }

@@ -102,6 +102,11 @@ impl InProcess {
         self.world.record_visits();
     }
 
+    /// Whether a coordinator acted in the last step.
+    pub fn was_event(&self) -> bool {
+        self.world.was_event()
+    }
+
     /// Runs one step; `false` once the run is over.
     ///
     /// # Panics

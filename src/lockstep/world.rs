@@ -26,6 +26,7 @@ pub struct WorldDriver<S, C, M> {
     /// Generation of each controller process.
     controller_generations: Vec<u32>,
     phase: Phase,
+    was_event: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -55,6 +56,7 @@ where
             controllers,
             controller_generations: vec![0; controllers as usize],
             phase: Phase::Publish,
+            was_event: false,
         }
     }
 
@@ -66,6 +68,11 @@ where
     /// Makes the world keep completed visits (see [`World::record_visits`]).
     pub fn record_visits(&mut self) {
         self.world.record_visits();
+    }
+
+    /// Whether a coordinator acted in the step published last.
+    pub fn was_event(&self) -> bool {
+        self.was_event
     }
 
     /// Does what can be done now.
@@ -83,6 +90,7 @@ where
     fn publish(&mut self) -> Result<(), LockstepError> {
         let finished = self.world.is_finished();
         let masks = self.world.coordinator_masks();
+        self.was_event = masks.acting != 0;
         let step = self.world.step();
         let header = FrameHeader {
             coordinators_acting: masks.acting,
@@ -90,16 +98,18 @@ where
             flags: if finished { FLAG_END_OF_RUN } else { 0 },
             ..self.identity.header(step, self.world.time_ns())
         };
-        let count = self.world.record_count();
         // Coordinators first: theirs is the longer way.
         for (index, outbox) in self.ports.coordinator_states.iter_mut().enumerate() {
             if finished || masks.acting >> index & 1 == 1 {
-                let world = &self.world;
-                let loan = outbox.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
+                let (world, index) = (&self.world, index as u32);
+                let loan = outbox.loan(header, world.coordinator_record_count(index), |slots| {
+                    world.coordinator_records(index).for_each(|r| slots.push(r));
+                })?;
                 check_reached("a coordinator's state frame", step, loan.send()?, 1, finished)?;
             }
         }
         let world = &self.world;
+        let count = world.record_count();
         let loan =
             self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
         self.world.seal(loan.records());

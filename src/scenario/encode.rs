@@ -1,33 +1,15 @@
 //! A scenario as bytes, and the hash by which participants of a run know that they have the same one.
-//!
-//! The only module that uses bincode: 2.0.1 is its last release and it is unmaintained (RUSTSEC-2025-0141),
-//! so whatever replaces it replaces it here.
 
 use super::Scenario;
-use thiserror::Error;
+pub use crate::encoding::DecodeError;
+use crate::encoding::{self, encode_onto};
 use xxhash_rust::xxh3::xxh3_64;
-
-/// No more bytes than this are decoded, nor allocated on the word of a length field: 4 million arrivals.
-const MAX_BYTES: usize = 64 << 20;
-
-/// Why bytes are not a scenario.
-#[derive(Debug, Error)]
-pub enum DecodeError {
-    /// More bytes than any scenario has.
-    #[error("scenario of {0} bytes, expected at most {MAX_BYTES}")]
-    TooLong(usize),
-    /// The bytes are not an encoded scenario.
-    #[error("not an encoded scenario: {0}")]
-    Malformed(#[from] bincode::error::DecodeError),
-    /// Bytes are left over.
-    #[error("{0} bytes after the end of the scenario")]
-    Trailing(usize),
-}
 
 /// The scenario as bytes; equal scenarios give equal bytes.
 pub fn encode(scenario: &Scenario) -> Vec<u8> {
-    bincode::serde::encode_to_vec(scenario, bincode::config::standard())
-        .expect("a scenario is made of numbers, strings and lists, all of which can be encoded in memory")
+    let mut bytes = Vec::new();
+    encode_onto(&mut bytes, scenario);
+    bytes
 }
 
 /// The scenario of such bytes.
@@ -35,15 +17,7 @@ pub fn encode(scenario: &Scenario) -> Vec<u8> {
 /// The values are not validated again: bytes from another process are to be compared with that process's
 /// [`scenario_hash`] first.
 pub fn decode(bytes: &[u8]) -> Result<Scenario, DecodeError> {
-    if bytes.len() > MAX_BYTES {
-        return Err(DecodeError::TooLong(bytes.len()));
-    }
-    let config = bincode::config::standard().with_limit::<MAX_BYTES>();
-    let (scenario, used) = bincode::serde::decode_from_slice(bytes, config)?;
-    match bytes.len() - used {
-        0 => Ok(scenario),
-        left => Err(DecodeError::Trailing(left)),
-    }
+    encoding::decode(bytes)
 }
 
 /// Hash of the scenario; never 0, which can therefore stand for "none".
@@ -80,7 +54,7 @@ mod tests {
         assert!(matches!(decode(&longer), Err(DecodeError::Trailing(1))));
         // A length field of 2^64 - 1 allocates nothing.
         assert!(matches!(decode(&[0xfd; 64]), Err(DecodeError::Malformed(_))));
-        assert!(matches!(decode(&vec![0; MAX_BYTES + 1]), Err(DecodeError::TooLong(_))));
+        assert!(matches!(decode(&vec![0; encoding::MAX_BYTES + 1]), Err(DecodeError::TooLong(_))));
         // Whatever single byte is wrong: an error or another scenario, no panic.
         for i in 0..bytes.len() {
             let mut wrong = bytes.clone();

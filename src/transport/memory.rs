@@ -68,13 +68,7 @@ impl<R: Record> Outbox<R> for MemoryOutbox<R> {
         };
         let inner = Rc::get_mut(&mut buffer).expect("nobody else holds a buffer taken for a loan");
         inner.header = FrameHeader { record_count: count as u32, ..header };
-        inner.records.clear();
-        inner.records.reserve(count);
-        let mut slots = Slots::new(&mut inner.records.spare_capacity_mut()[..count]);
-        fill(&mut slots);
-        slots.assert_full();
-        // SAFETY: `count` records of spare capacity were reserved above and all have been written.
-        unsafe { inner.records.set_len(count) };
+        Slots::fill_vec(&mut inner.records, count, fill);
         Ok(MemoryLoan { outbox: self, buffer })
     }
 }

@@ -66,6 +66,20 @@ impl<'a, R: Record> Slots<'a, R> {
         Slots { slots, filled: 0 }
     }
 
+    /// Replaces the records of a vector by `count` that `fill` writes.
+    ///
+    /// # Panics
+    /// When `fill` writes another number of records.
+    pub(crate) fn fill_vec(records: &mut Vec<R>, count: usize, fill: impl FnOnce(&mut Slots<'_, R>)) {
+        records.clear();
+        records.reserve(count);
+        let mut slots = Slots { slots: &mut records.spare_capacity_mut()[..count], filled: 0 };
+        fill(&mut slots);
+        slots.assert_full();
+        // SAFETY: `count` records of spare capacity were reserved above and all have been written.
+        unsafe { records.set_len(count) };
+    }
+
     /// Writes the next record.
     ///
     /// # Panics

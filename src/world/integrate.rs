@@ -4,7 +4,7 @@ use super::car::{Car, LeftCar, Visit};
 use super::gate::may_enter;
 use super::link::{self, Link};
 use super::metrics::{CompletedVisit, ZoneMetrics};
-use super::world::{Traffic, World};
+use super::role::{Traffic, World};
 use crate::scenario::{Exit, Scenario, Zone};
 use crate::vehicle::{Held, Merge, Pair, RearEnd, satisfiable_at};
 

@@ -5,7 +5,7 @@ mod gate;
 mod integrate;
 mod link;
 mod metrics;
-mod world;
+mod role;
 
 pub use metrics::{CompletedVisit, WorldSummary, ZoneSummaryRow};
-pub use world::{CommandFault, CoordinatorMasks, World};
+pub use role::{CommandFault, CoordinatorMasks, World};

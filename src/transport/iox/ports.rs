@@ -1,5 +1,6 @@
 //! The boxes over iceoryx2 ports.
 
+use super::bell::BellRope;
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -8,18 +9,24 @@ use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::ipc;
 use ipc_schemas::{FrameHeader, Record};
-use std::marker::PhantomData;
 
 /// The sending end of a service.
 #[derive(Debug)]
 pub struct IoxOutbox<R: Record> {
     service: String,
     publisher: Publisher<ipc::Service, [R], FrameHeader>,
+    bells: Vec<BellRope>,
 }
 
 impl<R: Record> IoxOutbox<R> {
     pub(super) fn new(service: String, publisher: Publisher<ipc::Service, [R], FrameHeader>) -> Self {
-        IoxOutbox { service, publisher }
+        IoxOutbox { service, publisher, bells: Vec::new() }
+    }
+
+    /// Rings these bells after every send.
+    pub fn ringing(mut self, bells: impl IntoIterator<Item = BellRope>) -> Self {
+        self.bells.extend(bells);
+        self
     }
 }
 
@@ -44,7 +51,7 @@ impl<R: Record> Outbox<R> for IoxOutbox<R> {
         slots.assert_full();
         // SAFETY: `assert_full` has established that all `count` records have been written.
         let sample = unsafe { sample.assume_init() };
-        Ok(IoxLoan { service: &self.service, sample, outbox: PhantomData })
+        Ok(IoxLoan { service: &self.service, sample, bells: &self.bells })
     }
 }
 
@@ -59,7 +66,7 @@ impl<R: Record> IoxOutbox<R> {
 pub struct IoxLoan<'a, R: Record> {
     service: &'a str,
     sample: SampleMut<ipc::Service, [R], FrameHeader>,
-    outbox: PhantomData<&'a mut ()>,
+    bells: &'a [BellRope],
 }
 
 impl<R: Record> Loan<R> for IoxLoan<'_, R> {
@@ -69,10 +76,12 @@ impl<R: Record> Loan<R> for IoxLoan<'_, R> {
 
     fn send(self) -> Result<usize, TransportError> {
         let service = self.service;
-        self.sample.send().map_err(|error| match error {
+        let reached = self.sample.send().map_err(|error| match error {
             SendError::UnableToDeliver => TransportError::ReceiverFull { service: service.to_owned() },
             other => TransportError::Failed { service: service.to_owned(), reason: format!("{other:?}") },
-        })
+        })?;
+        self.bells.iter().for_each(BellRope::ring);
+        Ok(reached)
     }
 }
 

@@ -82,7 +82,7 @@ pub enum SpaceError {
     },
 }
 
-fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
+pub(super) fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
     SpaceError::Failed { what: what.to_owned(), reason: format!("{reason:?}") }
 }
 
@@ -149,8 +149,9 @@ impl RunSpace {
     pub fn enter(run: &RunName) -> Result<RunSpace, SpaceError> {
         // Everything iceoryx2 reports comes back as an error value, which says it better.
         set_log_level(LogLevel::Fatal);
-        let base = base_directory()?;
+        let base = base_directory();
         let directory = base.join(run.to_string());
+        private_directory(&base)?;
         private_directory(&directory)?;
         let config = config(run, &directory)?;
         let node = NodeBuilder::new()
@@ -162,7 +163,7 @@ impl RunSpace {
         Ok(RunSpace { node: Some(node), config, run: run.clone(), directory })
     }
 
-    fn node(&self) -> &Node<ipc::Service> {
+    pub(super) fn node(&self) -> &Node<ipc::Service> {
         self.node.as_ref().expect("the node is only taken when the space is dropped")
     }
 
@@ -275,8 +276,9 @@ impl RunSpace {
     /// otherwise. Returns whether the space is now empty.
     pub fn sweep(run: &RunName) -> Result<bool, SpaceError> {
         set_log_level(LogLevel::Fatal);
-        let directory = base_directory()?.join(run.to_string());
+        let directory = base_directory().join(run.to_string());
         if !directory.exists() {
+            remove_base(&directory);
             return Ok(true);
         }
         let config = config(run, &directory)?;
@@ -308,34 +310,38 @@ fn sweep(config: &Config, run: &RunName, directory: &Path) -> bool {
     if alive || listed.is_err() {
         return false;
     }
-    let prefix = prefix(run);
+    let prefix = prefix(run, directory);
     for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
         if entry.file_name().to_string_lossy().starts_with(&prefix) {
             let _ = std::fs::remove_file(entry.path());
         }
     }
     let _ = std::fs::remove_dir_all(directory);
-    if let Some(base) = directory.parent() {
-        // Succeeds for the last run only, which is just what is wanted.
-        let _ = std::fs::remove_dir(base);
-    }
+    remove_base(directory);
     true
 }
 
-/// File-name prefix of a run's shared memory. The user id keeps users apart; the two separators keep a
-/// run `a` from matching the files of a run `a-b`.
-fn prefix(run: &RunName) -> String {
-    format!("cz_{}_{run}__", rustix::process::getuid().as_raw())
+/// Removes the directory of all runs; fails, as it should, while another run has its own in it.
+fn remove_base(directory: &Path) {
+    if let Some(base) = directory.parent() {
+        let _ = std::fs::remove_dir(base);
+    }
+}
+
+/// File-name prefix of a run's shared memory. The directory's hash in it keeps apart runs of one name in
+/// different runtime directories, which do not see each other's nodes and would otherwise sweep each
+/// other's memory; the fixed length of the hash keeps a run `a` from matching the files of a run `a-b`.
+fn prefix(run: &RunName, directory: &Path) -> String {
+    let place = xxhash_rust::xxh3::xxh3_64(directory.as_os_str().as_encoded_bytes()) as u32;
+    format!("cz_{}_{run}_{place:08x}_", rustix::process::getuid().as_raw())
 }
 
 /// The directory under which each run has its own: in the user's runtime directory where there is one.
-fn base_directory() -> Result<PathBuf, SpaceError> {
-    let base = match std::env::var_os("XDG_RUNTIME_DIR") {
+fn base_directory() -> PathBuf {
+    match std::env::var_os("XDG_RUNTIME_DIR") {
         Some(runtime) if Path::new(&runtime).is_dir() => PathBuf::from(runtime).join("cz"),
         _ => std::env::temp_dir().join(format!("cz-{}", rustix::process::getuid().as_raw())),
-    };
-    private_directory(&base)?;
-    Ok(base)
+    }
 }
 
 fn private_directory(path: &Path) -> Result<(), SpaceError> {
@@ -359,12 +365,12 @@ fn config(run: &RunName, directory: &Path) -> Result<Config, SpaceError> {
     let path = iceoryx2::prelude::Path::new(path.as_bytes())
         .map_err(|e| failed(&format!("use the directory {path}"), &e))?;
     config.global.set_root_path(&path);
-    config.global.prefix = iceoryx2::prelude::FileName::new(prefix(run).as_bytes())
+    config.global.prefix = iceoryx2::prelude::FileName::new(prefix(run, directory).as_bytes())
         .map_err(|e| failed("form a file-name prefix", &e))?;
     Ok(config)
 }
 
-fn service_name(name: &str) -> Result<ServiceName, SpaceError> {
+pub(super) fn service_name(name: &str) -> Result<ServiceName, SpaceError> {
     ServiceName::new(name).map_err(|e| failed(&format!("form the service name {name}"), &e))
 }
 

@@ -30,8 +30,17 @@ pub struct World {
     state_hash: u64,
     /// Zones of each coordinator process, their neighbour processes, and who had an event.
     coordinators: Vec<CoordinatorShare>,
+    /// Per zone: an event in the step just ended, an event one step earlier, acts in the present step.
+    marks: Vec<ZoneMarks>,
     summarised: u64,
     commanded: u32,
+}
+
+#[derive(Clone, Copy, Debug, Default)]
+struct ZoneMarks {
+    event: bool,
+    event_before: bool,
+    acts: bool,
 }
 
 /// The vehicles of one zone.
@@ -44,9 +53,14 @@ pub(super) struct Traffic {
 }
 
 impl Traffic {
+    fn record_count(&self) -> usize {
+        self.cars.len() + usize::from(self.left.is_some())
+    }
+
     /// Whether a vehicle entered or left in the step just ended.
     fn has_event(&self) -> bool {
-        self.left.is_some_and(|l| l.left_now) || self.cars.iter().rev().any(|c| c.entered)
+        // Newcomers are appended, so the last member is one if any is.
+        self.left.is_some_and(|l| l.left_now) || self.cars.last().is_some_and(|c| c.entered)
     }
 }
 
@@ -126,6 +140,7 @@ impl World {
             visits: None,
             state_hash: 0,
             coordinators: shares,
+            marks: vec![ZoneMarks::default(); zones],
             summarised: 0,
             commanded: 0,
             scenario,
@@ -165,16 +180,56 @@ impl World {
         self.held_u_mps2.len() as u32
     }
 
+    /// Vehicles that have left the network so far.
+    pub fn departed(&self) -> u32 {
+        self.departed
+    }
+
     /// The number of records of the present state frame.
     pub fn record_count(&self) -> usize {
-        let in_zones: usize = self.zones.iter().map(|z| z.cars.len() + usize::from(z.left.is_some())).sum();
+        let in_zones: usize = self.zones.iter().map(Traffic::record_count).sum();
         in_zones + self.links.iter().map(|l| l.cars.len()).sum::<usize>()
+    }
+
+    /// The number of records of the frame for a coordinator process.
+    pub fn coordinator_record_count(&self, coordinator: u32) -> usize {
+        self.acting_zones(coordinator).map(|z| self.zones[z].record_count()).sum()
+    }
+
+    /// The records of the frame for a coordinator process: those of its zones that act in this step.
+    pub fn coordinator_records(&self, coordinator: u32) -> impl Iterator<Item = VehicleState> + '_ {
+        self.acting_zones(coordinator).flat_map(|z| self.zone_records(z))
+    }
+
+    fn acting_zones(&self, coordinator: u32) -> impl Iterator<Item = usize> + '_ {
+        let zones = self.coordinators[coordinator as usize].zones.clone();
+        (zones.start as usize..zones.end as usize).filter(|&z| self.marks[z].acts)
     }
 
     /// The records of the present state frame (see [`VehicleState`] for their order).
     pub fn records(&self) -> impl Iterator<Item = VehicleState> + '_ {
-        let length_m = self.scenario.vehicle.length_m;
-        let record = move |car: &Car, zone: u32, flags: u16| VehicleState {
+        let in_zones = (0..self.zones.len()).flat_map(|z| self.zone_records(z));
+        let on_links =
+            self.links.iter().flat_map(|link| link.cars.iter().map(|c| self.record(c, frames::NO_ZONE, 0)));
+        in_zones.chain(on_links)
+    }
+
+    /// A zone's S(t).
+    fn zone_records(&self, zone: usize) -> impl Iterator<Item = VehicleState> + '_ {
+        let traffic = &self.zones[zone];
+        let left = traffic.left.iter().map(move |l| {
+            let now = if l.left_now { frames::STATE_LEFT_NOW } else { 0 };
+            self.record(&l.car, zone as u32, frames::STATE_LEFT | now)
+        });
+        let members = traffic
+            .cars
+            .iter()
+            .map(move |c| self.record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 }));
+        left.chain(members)
+    }
+
+    fn record(&self, car: &Car, zone: u32, flags: u16) -> VehicleState {
+        VehicleState {
             x_m: car.x_m,
             v_mps: car.v_mps,
             u_mps2: car.u_mps2,
@@ -182,29 +237,13 @@ impl World {
             entry_speed_mps: car.entry_speed_mps,
             planned_exit_time_s: car.planned_exit_time_s,
             planned_exit_speed_mps: car.planned_exit_speed_mps,
-            length_m,
+            length_m: self.scenario.vehicle.length_m,
             vehicle: car.vehicle,
             zone,
             path: car.path,
             kind: frames::KIND_CAV,
             flags,
-        };
-        let in_zones = self.zones.iter().enumerate().flat_map(move |(zone, traffic)| {
-            let left = traffic.left.iter().map(move |l| {
-                let now = if l.left_now { frames::STATE_LEFT_NOW } else { 0 };
-                record(&l.car, zone as u32, frames::STATE_LEFT | now)
-            });
-            let members = traffic
-                .cars
-                .iter()
-                .map(move |c| record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 }));
-            left.chain(members)
-        });
-        let on_links = self
-            .links
-            .iter()
-            .flat_map(move |link| link.cars.iter().map(move |c| record(c, frames::NO_ZONE, 0)));
-        in_zones.chain(on_links)
+        }
     }
 
     /// Chains a published state frame into the state hash.
@@ -222,10 +261,19 @@ impl World {
     /// A process acts when one of its zones has an event, when one had an event in the previous step
     /// (its other zones hear of it now), or when a neighbouring process had one then.
     pub fn coordinator_masks(&mut self) -> CoordinatorMasks {
+        for (marks, traffic) in self.marks.iter_mut().zip(&self.zones) {
+            marks.event_before = marks.event;
+            marks.event = traffic.has_event();
+        }
+        for zone in 0..self.marks.len() {
+            let told =
+                self.scenario.network.neighbours(zone as u32).any(|n| self.marks[n as usize].event_before);
+            self.marks[zone].acts = self.marks[zone].event || told;
+        }
         let mut events = 0u64;
         for (i, share) in self.coordinators.iter().enumerate() {
-            let own = &self.zones[share.zones.start as usize..share.zones.end as usize];
-            if own.iter().any(Traffic::has_event) {
+            let own = &self.marks[share.zones.start as usize..share.zones.end as usize];
+            if own.iter().any(|marks| marks.event) {
                 events |= 1 << i;
             }
         }

@@ -1,0 +1,290 @@
+//! Command-line arguments.
+
+use crate::process::{Placement, WaitMode};
+use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
+use crate::scenario::{Override, Scenario, ScenarioError, load};
+use crate::transport::iox::RunName;
+use clap::{Args, Parser, Subcommand};
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Safe, optimal coordination of connected automated vehicles through networks of control zones.
+///
+/// `cz run` runs the embedded two-zone merging experiment as three processes that exchange frames
+/// through shared memory, and prints a table of results.
+#[derive(Debug, Parser)]
+#[command(name = "cz", version, propagate_version = true)]
+pub(super) struct Cz {
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum Command {
+    /// Run a scenario: start all processes, show progress, print the results.
+    Run(RunArgs),
+    /// Start only the world of a run (the same as the program cz-world).
+    World(WorldArgs),
+    /// Start only a coordinator of a run (the same as the program cz-coord).
+    Coord(PartArgs),
+    /// Start only a controller of a run (the same as the program cz-ctrl).
+    Ctrl(PartArgs),
+    /// Compute one reference trajectory: duration, coefficients, cost.
+    Plan(PlanArgs),
+    /// Measure latency, the solver, or scale on this machine.
+    Bench(BenchArgs),
+}
+
+#[derive(Debug, Args)]
+pub(super) struct BenchArgs {
+    #[command(subcommand)]
+    pub kind: BenchKind,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum BenchKind {
+    /// One step, next to the machine's floor and to what one would write instead.
+    Latency(MeasureArgs),
+    /// The closed-form QP next to Clarabel, and the whole controller.
+    Solver(MeasureArgs),
+    /// Step time from a hundred to a hundred thousand vehicles.
+    Scale(MeasureArgs),
+    /// The other process of a measurement.
+    #[command(hide = true)]
+    Peer(PeerArgs),
+}
+
+#[derive(Debug, Args)]
+pub(super) struct MeasureArgs {
+    /// Fewer repetitions, smaller sizes: a check that it works rather than a measurement.
+    #[arg(long)]
+    pub quick: bool,
+    /// Also write the results as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct PeerArgs {
+    #[command(flatten)]
+    pub scenario: PeerScenarioArgs,
+    pub kind: String,
+    pub values: Vec<String>,
+}
+
+/// The scenario of a measurement's other process: always the default one, changed.
+#[derive(Debug, Args)]
+pub(super) struct PeerScenarioArgs {
+    #[arg(long)]
+    pub seed: Option<u64>,
+    #[arg(long = "set")]
+    pub set: Vec<String>,
+}
+
+impl PeerScenarioArgs {
+    pub fn load(&self) -> Result<Scenario, ScenarioError> {
+        let (seed, set) = (self.seed, self.set.clone());
+        ScenarioArgs { scenario: None, seed, set, corridors: None }.load()
+    }
+}
+
+/// A program of its own around the arguments of a subcommand.
+#[derive(Debug, Parser)]
+#[command(version)]
+pub(super) struct Standalone<A: Args> {
+    #[command(flatten)]
+    pub args: A,
+}
+
+/// Which scenario, and what is changed in it.
+#[derive(Clone, Debug, Args)]
+pub(super) struct ScenarioArgs {
+    /// Scenario: a TOML file, or one of the embedded two-merges (default), varying-demand, corridor-8,
+    /// tree.
+    pub scenario: Option<String>,
+    /// Seed of all random streams, in place of the scenario's.
+    #[arg(long, value_name = "N")]
+    pub seed: Option<u64>,
+    /// Change a scenario key, e.g. `--set zones.merge-1.flow.gain_mps=0.3`; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// A generated network that holds about this many vehicles at once.
+    #[arg(long, hide = true, value_name = "VEHICLES")]
+    pub corridors: Option<usize>,
+}
+
+/// Simulated time of a generated network's run, s: filling up, then thirty seconds to measure.
+const CORRIDORS_UNTIL_S: f64 = 90.0;
+
+impl ScenarioArgs {
+    /// Loads and validates the scenario.
+    pub fn load(&self) -> Result<Scenario, ScenarioError> {
+        if let Some(vehicles) = self.corridors {
+            return crate::bench::corridors(vehicles, CORRIDORS_UNTIL_S);
+        }
+        let overrides = self.set.iter().map(|s| s.parse()).collect::<Result<Vec<Override>, _>>()?;
+        load(self.scenario.as_deref(), &overrides, self.seed)
+    }
+
+    /// The flags again, without the scenario itself.
+    pub fn to_flags(&self) -> Vec<String> {
+        let mut arguments: Vec<String> = Vec::new();
+        if let Some(seed) = self.seed {
+            arguments.extend(["--seed".to_owned(), seed.to_string()]);
+        }
+        arguments.extend(self.set.iter().map(|set| format!("--set={set}")));
+        arguments
+    }
+
+    /// Whether the command line says anything about the scenario.
+    pub fn is_given(&self) -> bool {
+        self.scenario.is_some() || self.seed.is_some() || !self.set.is_empty() || self.corridors.is_some()
+    }
+
+    /// The arguments again, for a child process.
+    pub fn to_arguments(&self) -> Vec<String> {
+        let mut arguments = self.to_flags();
+        if let Some(vehicles) = self.corridors {
+            arguments.extend(["--corridors".to_owned(), vehicles.to_string()]);
+        }
+        if let Some(scenario) = &self.scenario {
+            arguments.extend(["--".to_owned(), scenario.clone()]);
+        }
+        arguments
+    }
+}
+
+/// Into how many processes coordination and control are divided.
+#[derive(Clone, Copy, Debug, Args)]
+pub(super) struct ShareArgs {
+    /// Number of controller processes; zones are shared out evenly.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_CONTROLLERS)))]
+    pub ctrl_procs: u32,
+    /// Number of coordinator processes; zones are shared out evenly.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_COORDINATORS)))]
+    pub coord_procs: u32,
+}
+
+impl ShareArgs {
+    /// Refuses more processes than there are zones to share out.
+    pub fn check(&self, scenario: &Scenario) -> Result<(), super::AppError> {
+        let zones = scenario.network.zones.len() as u32;
+        for (name, count) in [("--ctrl-procs", self.ctrl_procs), ("--coord-procs", self.coord_procs)] {
+            if count > zones {
+                let scenario = &scenario.name;
+                return Err(super::AppError::Usage(format!(
+                    "{name} {count}: expected at most {zones}, the number of zones of scenario {scenario}"
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Bounds of all waiting.
+#[derive(Clone, Copy, Debug, Args)]
+pub(super) struct WaitArgs {
+    /// How long to wait for the other processes of the run to appear, s.
+    #[arg(long, value_name = "SECONDS", default_value = "30", value_parser = seconds)]
+    pub attach_timeout: Duration,
+    /// How long to wait for a frame before giving the run up, s.
+    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds)]
+    pub peer_timeout: Duration,
+    /// Pin the processes to cores.
+    #[arg(long, value_enum, default_value_t = Placement::None)]
+    pub pin: Placement,
+}
+
+fn seconds(text: &str) -> Result<Duration, String> {
+    match text.parse::<f64>() {
+        Ok(s) if s > 0.0 && s <= 86_400.0 => Ok(Duration::from_secs_f64(s)),
+        _ => Err("expected a number of seconds > 0 and <= 86400".to_owned()),
+    }
+}
+
+#[derive(Debug, Args)]
+pub(super) struct RunArgs {
+    #[command(flatten)]
+    pub scenario: ScenarioArgs,
+    /// Run everything in this process, without shared memory.
+    #[arg(long)]
+    pub in_process: bool,
+    #[command(flatten)]
+    pub share: ShareArgs,
+    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+    /// Name of the run; runs of different names do not see each other [default: one of its own].
+    #[arg(long, value_name = "NAME", conflicts_with = "in_process")]
+    pub run: Option<RunName>,
+    #[command(flatten)]
+    pub wait: WaitArgs,
+    /// How the processes of the run wait for frames.
+    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
+    pub wait_mode: WaitMode,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct WorldArgs {
+    /// Name of the run; the other parts are started with the same name.
+    #[arg(long, value_name = "NAME")]
+    pub run: RunName,
+    #[command(flatten)]
+    pub scenario: ScenarioArgs,
+    #[command(flatten)]
+    pub share: ShareArgs,
+    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+    #[command(flatten)]
+    pub wait: WaitArgs,
+    /// How the processes of the run wait for frames.
+    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
+    pub wait_mode: WaitMode,
+    /// Process id of the supervisor: report to it on stdout, and end with it.
+    #[arg(long, hide = true, value_name = "PID")]
+    pub supervised: Option<u32>,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct PartArgs {
+    /// Name of the run to join.
+    #[arg(long, value_name = "NAME")]
+    pub run: RunName,
+    /// Index among the processes of the same role [default: the first free one].
+    #[arg(long, value_name = "I")]
+    pub index: Option<u16>,
+    #[command(flatten)]
+    pub scenario: ScenarioArgs,
+    #[command(flatten)]
+    pub wait: WaitArgs,
+    /// Process id of the supervisor: end with it.
+    #[arg(long, hide = true, value_name = "PID")]
+    pub supervised: Option<u32>,
+}
+
+#[derive(Debug, Args)]
+#[command(group = clap::ArgGroup::new("terminal").required(true))]
+pub(super) struct PlanArgs {
+    /// Entry speed, m/s.
+    #[arg(long, value_name = "M_PER_S")]
+    pub v0: f64,
+    /// Length of the approach, m.
+    #[arg(long, value_name = "M")]
+    pub length: f64,
+    /// Weight of time against energy, m^2/s^4.
+    #[arg(long, value_name = "BETA")]
+    pub beta: f64,
+    /// Terminal speed v_m, m/s.
+    #[arg(long, value_name = "M_PER_S", group = "terminal")]
+    pub vm: Option<f64>,
+    /// Leave the terminal speed free.
+    #[arg(long, group = "terminal")]
+    pub free: bool,
+    /// Use the transversality condition as the paper prints it.
+    #[arg(long)]
+    pub as_printed: bool,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}

@@ -1,0 +1,213 @@
+//! `cz bench`: measurements.
+
+use super::args::{BenchArgs, BenchKind, PeerArgs, ScenarioArgs, ShareArgs, WaitArgs};
+use super::supervise::{Plan, supervise};
+use super::{AppError, print};
+use crate::bench::{
+    self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport,
+};
+use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, run_in_process};
+use crate::transport::iox::RunName;
+use comfy_table::{CellAlignment, Table, presets};
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+impl From<BenchError> for AppError {
+    fn from(error: BenchError) -> AppError {
+        AppError::Failed(error.to_string())
+    }
+}
+
+pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
+    match &args.kind {
+        BenchKind::Latency(args) => {
+            let report = latency(args.quick)?;
+            deliver(args.json.as_deref(), &report, &latency_table(&report))
+        }
+        BenchKind::Solver(args) => {
+            let scenario = Arc::new(scenario_of(args.quick).load()?);
+            let report = bench::solver(&scenario)?;
+            deliver(args.json.as_deref(), &report, &solver_table(&report))
+        }
+        BenchKind::Scale(args) => {
+            let report = scale(args.quick)?;
+            deliver(args.json.as_deref(), &report, &scale_table(&report))
+        }
+        BenchKind::Peer(args) => peer(args),
+    }
+}
+
+fn deliver(json: Option<&Path>, report: &impl serde::Serialize, table: &str) -> Result<(), AppError> {
+    let Some(path) = json else { return print(table) };
+    let text = serde_json::to_string_pretty(report).expect("reports have string keys only") + "\n";
+    if path == Path::new("-") {
+        return print(&text);
+    }
+    std::fs::write(path, text)
+        .map_err(|e| AppError::Failed(format!("cannot write {}: {e}", path.display())))?;
+    print(table)
+}
+
+/// The default scenario with the whole trace: ten times as many steps as `cz run` takes.
+fn scenario_of(quick: bool) -> ScenarioArgs {
+    let set = if quick { vec![] } else { vec!["end.vehicles=600".to_owned()] };
+    ScenarioArgs { scenario: None, seed: Some(1), set, corridors: None }
+}
+
+const WAIT: WaitArgs = WaitArgs {
+    attach_timeout: Duration::from_secs(30),
+    peer_timeout: Duration::from_secs(30),
+    pin: Placement::Auto,
+};
+
+fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, String> {
+    let plan = Plan {
+        run: own_name(),
+        scenario,
+        share: ShareArgs { ctrl_procs: controllers, coord_procs: 1 },
+        wait: WAIT,
+        wait_mode: WaitMode::Hybrid,
+    };
+    supervise(&plan, |_| {}).map_err(|e| e.to_string())
+}
+
+fn own_name() -> RunName {
+    format!("cz-{}", std::process::id()).parse().expect("letters, a dash and digits are a run name")
+}
+
+fn latency(quick: bool) -> Result<LatencyReport, AppError> {
+    let arguments = scenario_of(quick);
+    let scenario = Arc::new(arguments.load()?);
+    let start_peer = |kind: &[String]| {
+        let mut command = Command::new(std::env::current_exe()?);
+        command.args(["bench", "peer"]).args(arguments.to_flags()).args(kind);
+        command.stdin(Stdio::null()).spawn()
+    };
+    let options = LatencyOptions {
+        scenario,
+        round_trips: if quick { 20_000 } else { 200_000 },
+        start_peer: &start_peer,
+        run_processes: &|| run_processes(&arguments, 1),
+    };
+    Ok(bench::latency(&options)?)
+}
+
+fn peer(args: &PeerArgs) -> Result<(), AppError> {
+    let scenario = Arc::new(args.scenario.load()?);
+    let bad = || AppError::Usage(format!("bench peer {} {:?}: not a peer", args.kind, args.values));
+    let number = |i: usize| args.values.get(i).and_then(|v| v.parse::<u64>().ok()).ok_or_else(bad);
+    let text = |i: usize| args.values.get(i).cloned().ok_or_else(bad);
+    let kind = match args.kind.as_str() {
+        "word" => PeerKind::Word { path: text(0)?, count: number(1)? },
+        "iceoryx2" => PeerKind::Iceoryx2 { run: text(0)?.parse().map_err(|_| bad())?, count: number(1)? },
+        "unix" => PeerKind::Unix { path: text(0)? },
+        "tcp" => PeerKind::Tcp { port: u16::try_from(number(0)?).map_err(|_| bad())? },
+        _ => return Err(bad()),
+    };
+    Ok(bench::run_peer(&kind, &scenario)?)
+}
+
+fn scale(quick: bool) -> Result<ScaleReport, AppError> {
+    let sizes = if quick { vec![100, 1_000] } else { vec![100, 1_000, 10_000, 100_000] };
+    let run = |size: usize, controllers: u32| {
+        let arguments = ScenarioArgs { scenario: None, seed: None, set: vec![], corridors: Some(size) };
+        if controllers == 0 {
+            let scenario = Arc::new(arguments.load().map_err(|e| e.to_string())?);
+            return run_in_process(&scenario, 1, 1, &StopFlag::none(), |_| {}).map_err(|e| e.to_string());
+        }
+        run_processes(&arguments, controllers)
+    };
+    Ok(bench::scale(&ScaleOptions { sizes, run: &run }, |point| {
+        eprintln!("{} vehicles, {} controllers: {} ns", point.vehicles, point.controllers, point.step_ns);
+    })?)
+}
+
+fn table(header: &[&str]) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::UTF8_HORIZONTAL_ONLY);
+    table.set_header(header.iter().copied());
+    table
+}
+
+fn align(table: &mut Table) {
+    for column in table.column_iter_mut().skip(1) {
+        column.set_cell_alignment(CellAlignment::Right);
+    }
+}
+
+fn latency_table(r: &LatencyReport) -> String {
+    let mut table = table(&["ns", "p50", "p90", "p99", "p99.9", "max", "count", "p50 / floor", "p50 / ours"]);
+    let floor = r.floor_round_trip.p50.max(1) as f64;
+    let ours = r.steady_step.p50.max(1) as f64;
+    let mut row = |name: &str, p: &Percentiles| {
+        let p50 = p.p50 as f64;
+        table.add_row([
+            name.to_owned(),
+            p.p50.to_string(),
+            p.p90.to_string(),
+            p.p99.to_string(),
+            p.p999.to_string(),
+            p.max.to_string(),
+            p.count.to_string(),
+            format!("{:.1}", p50 / floor),
+            format!("{:.2}", p50 / ours),
+        ]);
+    };
+    row("shared word, round trip (the floor)", &r.floor_round_trip);
+    row("iceoryx2, round trip", &r.iceoryx2_round_trip);
+    row("step in one process", &r.in_process_step);
+    row("event step in one process", &r.in_process_event_step);
+    row("step, three processes (ours)", &r.steady_step);
+    row("event step, three processes", &r.event_step);
+    row("step over a unix socket", &r.unix_socket_step);
+    row("step over TCP", &r.tcp_step);
+    align(&mut table);
+    format!(
+        "{}\n{}, {:.1} records per frame\n{table}\n\
+         our step / (step in one process + iceoryx2 round trip) = {:.2}; p99 / p50 = {:.1}\n\
+         unix socket / ours = {:.1}; TCP / ours = {:.1}\n",
+        r.machine, r.scenario, r.mean_records, r.ratio_to_parts, r.ratio_tail, r.ratio_unix, r.ratio_tcp
+    )
+}
+
+fn solver_table(r: &SolverReport) -> String {
+    format!(
+        "{}\n{}: {} QPs ({} infeasible), {} vehicle-steps\n\
+         closed form      {:>10.1} ns per QP\n\
+         Clarabel, fresh  {:>10.1} ns per QP, {:.0} times as long; greatest difference {:.1e} m/s²\n\
+         whole controller {:>10.1} ns per vehicle-step\n",
+        r.machine,
+        r.scenario,
+        r.programs,
+        r.infeasible,
+        r.vehicle_steps,
+        r.closed_form_ns,
+        r.clarabel_ns,
+        r.ratio,
+        r.greatest_difference_mps2,
+        r.controller_ns
+    )
+}
+
+fn scale_table(r: &ScaleReport) -> String {
+    let mut table =
+        table(&["controllers", "vehicles", "zones", "step [µs]", "ns per vehicle-step", "world [MiB]"]);
+    for p in &r.points {
+        table.add_row([
+            if p.controllers == 0 { "in process".to_owned() } else { p.controllers.to_string() },
+            p.vehicles.to_string(),
+            p.zones.to_string(),
+            format!("{:.1}", p.step_ns as f64 / 1e3),
+            format!("{:.1}", p.ns_per_vehicle_step),
+            format!("{:.1}", p.world_bytes as f64 / f64::from(1 << 20)),
+        ]);
+    }
+    align(&mut table);
+    let mut text = format!("{}\n{table}\n", r.machine);
+    for (controllers, exponent) in &r.growth_exponents {
+        text.push_str(&format!("growth exponent, {controllers} controller processes: {exponent:.3}\n"));
+    }
+    text
+}

@@ -1,0 +1,107 @@
+//! The command line: what the four programs have in common, and what they print.
+
+mod args;
+mod bench;
+mod parts;
+mod plan;
+mod report;
+mod run;
+mod supervise;
+
+use crate::process::ProcessError;
+use crate::scenario::ScenarioError;
+use clap::Parser;
+use std::process::ExitCode;
+
+/// Why a command did not succeed; decides the exit code.
+#[derive(Debug, thiserror::Error)]
+pub enum AppError {
+    /// The scenario is no good.
+    #[error(transparent)]
+    Scenario(#[from] ScenarioError),
+    /// An argument is no good.
+    #[error("{0}")]
+    Usage(String),
+    /// The run failed.
+    #[error("{0}")]
+    Failed(String),
+    /// The run was interrupted.
+    #[error("{0}")]
+    Interrupted(String),
+}
+
+impl AppError {
+    /// 1 the run failed, 2 bad input, 130 interrupted.
+    fn exit_code(&self) -> u8 {
+        match self {
+            AppError::Scenario(_) | AppError::Usage(_) => 2,
+            AppError::Failed(_) => 1,
+            AppError::Interrupted(_) => 130,
+        }
+    }
+}
+
+impl From<ProcessError> for AppError {
+    fn from(error: ProcessError) -> AppError {
+        match error {
+            ProcessError::Interrupted { .. } => AppError::Interrupted(error.to_string()),
+            ProcessError::AlreadyActive { .. } | ProcessError::TooFewCores { .. } => {
+                AppError::Usage(error.to_string())
+            }
+            other => AppError::Failed(other.to_string()),
+        }
+    }
+}
+
+/// `cz`.
+pub fn cz() -> ExitCode {
+    let args = args::Cz::parse();
+    finish(
+        "cz",
+        match args.command {
+            args::Command::Run(args) => run::run(&args),
+            args::Command::World(args) => parts::world(&args),
+            args::Command::Coord(args) => parts::coordinator(&args),
+            args::Command::Ctrl(args) => parts::controller(&args),
+            args::Command::Plan(args) => plan::plan(&args),
+            args::Command::Bench(args) => bench::bench(&args),
+        },
+    )
+}
+
+/// `cz-world`, the same as `cz world`.
+pub fn cz_world() -> ExitCode {
+    finish("cz-world", parts::world(&args::Standalone::<args::WorldArgs>::parse().args))
+}
+
+/// `cz-coord`, the same as `cz coord`.
+pub fn cz_coord() -> ExitCode {
+    finish("cz-coord", parts::coordinator(&args::Standalone::<args::PartArgs>::parse().args))
+}
+
+/// `cz-ctrl`, the same as `cz ctrl`.
+pub fn cz_ctrl() -> ExitCode {
+    finish("cz-ctrl", parts::controller(&args::Standalone::<args::PartArgs>::parse().args))
+}
+
+fn finish(program: &str, result: Result<(), AppError>) -> ExitCode {
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{program}: {error}");
+            ExitCode::from(error.exit_code())
+        }
+    }
+}
+
+/// Writes to stdout; a reader that has gone away is no reason to panic.
+fn print(text: &str) -> Result<(), AppError> {
+    use std::io::{ErrorKind, Write};
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(e) if e.kind() != ErrorKind::BrokenPipe => {
+            Err(AppError::Failed(format!("cannot write to stdout: {e}")))
+        }
+        _ => Ok(()),
+    }
+}

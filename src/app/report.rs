@@ -1,0 +1,153 @@
+//! The summary of a run: as JSON, and as a table for people.
+
+use super::{AppError, print};
+use crate::process::{LatencyUs, Outcome};
+use crate::scenario::Scenario;
+use crate::world::ZoneSummaryRow;
+use comfy_table::{Cell, CellAlignment, Table, presets};
+use serde::Serialize;
+use std::path::Path;
+
+/// The summary; its JSON keys are a contract.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Summary {
+    scenario: String,
+    seed: u64,
+    transport: &'static str,
+    processes: u32,
+    steps: u64,
+    dt_s: f64,
+    beta: f64,
+    state_hash: String,
+    wall_s: f64,
+    step_latency_us: LatencyUs,
+    zones: Vec<ZoneSummaryRow>,
+    total_objective: f64,
+    arrived: u32,
+    departed: u32,
+    held_arrivals: u32,
+    waiting: u32,
+}
+
+/// How the frames of a run travelled.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Transport {
+    InProcess,
+    Iceoryx2 { processes: u32 },
+}
+
+impl Summary {
+    pub fn new(scenario: &Scenario, transport: Transport, outcome: Outcome) -> Summary {
+        let (transport, processes) = match transport {
+            Transport::InProcess => ("in-process", 1),
+            Transport::Iceoryx2 { processes } => ("iceoryx2", processes),
+        };
+        let world = outcome.world;
+        Summary {
+            scenario: scenario.name.clone(),
+            seed: scenario.seed,
+            transport,
+            processes,
+            steps: world.steps,
+            dt_s: scenario.dt_s(),
+            beta: scenario.beta,
+            state_hash: format!("{:016x}", world.state_hash),
+            wall_s: outcome.wall_s,
+            step_latency_us: outcome.step_latency_us,
+            total_objective: world.zones.iter().map(|z| z.mean_objective).sum(),
+            zones: world.zones,
+            arrived: world.arrived,
+            departed: world.departed,
+            held_arrivals: world.held_arrivals,
+            waiting: world.waiting,
+        }
+    }
+
+    /// Prints the table, or writes the JSON, or both.
+    pub fn deliver(&self, json: Option<&Path>) -> Result<(), AppError> {
+        let Some(path) = json else { return print(&self.table()) };
+        let text = serde_json::to_string_pretty(self).expect("a summary has string keys only") + "\n";
+        if path == Path::new("-") {
+            return print(&text);
+        }
+        std::fs::write(path, text)
+            .map_err(|e| AppError::Failed(format!("cannot write {}: {e}", path.display())))?;
+        print(&self.table())
+    }
+
+    fn table(&self) -> String {
+        let mut table = Table::new();
+        table.load_style(presets::UTF8_HORIZONTAL_ONLY);
+        table.set_header([
+            "zone",
+            "vehicles",
+            "time\n[s]",
+            "energy\n[m²/s³]",
+            "objective\n[m²/s³]",
+            "FE\nvehicles",
+            "FE time\n[s]",
+            "infeasible\nvehicles",
+            "rear-end margin\nall / entered safe [m]",
+            "merge margin\nall / entered safe [m]",
+        ]);
+        for zone in &self.zones {
+            let margins =
+                |all: Option<f64>, clean: Option<f64>| format!("{} / {}", metres(all), metres(clean));
+            table.add_row([
+                zone.zone.clone(),
+                zone.vehicles.to_string(),
+                format!("{:.3}", zone.mean_time_s),
+                format!("{:.3}", zone.mean_energy),
+                format!("{:.3}", zone.mean_objective),
+                zone.fe_vehicles.to_string(),
+                format!("{:.3}", zone.fe_mean_s),
+                zone.infeasible_vehicles.to_string(),
+                margins(zone.min_rear_end_margin_m, zone.min_rear_end_margin_clean_m),
+                margins(zone.min_merge_margin_m, zone.min_merge_margin_clean_m),
+            ]);
+        }
+        let mut total = vec![Cell::new("total"), Cell::new(self.departed), Cell::new(""), Cell::new("")];
+        total.push(Cell::new(format!("{:.3}", self.total_objective)));
+        table.add_row(total);
+        for column in table.column_iter_mut().skip(1) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+        let how = match self.processes {
+            1 => "in one process".to_owned(),
+            n => format!("in {n} processes over {}", self.transport),
+        };
+        let l = &self.step_latency_us;
+        let mut text = format!(
+            "{}, seed {}: {} steps of {} s {how}, {:.2} s wall time\n{table}\n\
+             step latency p50 {:.1} µs, p99 {:.1}, p99.9 {:.1}, max {:.1}; beta {:.4}\n",
+            self.scenario,
+            self.seed,
+            self.steps,
+            self.dt_s,
+            self.wall_s,
+            l.p50,
+            l.p99,
+            l.p999,
+            l.max,
+            self.beta
+        );
+        if self.held_arrivals > 0 {
+            text.push_str(&format!(
+                "{} arrivals had to wait outside; {} still waited at the end\n",
+                self.held_arrivals, self.waiting
+            ));
+        }
+        if self.arrived > self.departed {
+            text.push_str(&format!(
+                "{} vehicles were still inside at the end\n",
+                self.arrived - self.departed
+            ));
+        }
+        text.push_str(&format!("state hash {}\n", self.state_hash));
+        text
+    }
+}
+
+fn metres(margin: Option<f64>) -> String {
+    margin.map_or_else(|| "-".to_owned(), |m| format!("{m:.3}"))
+}

@@ -1,0 +1,90 @@
+//! `cz run`: a whole run, in this process or in several.
+
+use super::AppError;
+use super::args::RunArgs;
+use super::report::{Summary, Transport};
+use super::supervise::{self, Plan};
+use crate::process::{StopFlag, WaitMode, check_cores, run_in_process};
+use crate::scenario::Scenario;
+use crate::transport::iox::RunName;
+use crate::world::World;
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::sync::Arc;
+
+pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
+    let scenario = Arc::new(args.scenario.load()?);
+    args.share.check(&scenario)?;
+    if args.wait_mode == WaitMode::Spin && !args.in_process {
+        check_cores(1 + (args.share.coord_procs + args.share.ctrl_procs) as usize)?;
+    }
+    let bar = Bar::new(&scenario);
+    let (transport, outcome) = if args.in_process {
+        let stop = StopFlag::from_signals()?;
+        let shares = args.share;
+        let outcome = run_in_process(&scenario, shares.coord_procs, shares.ctrl_procs, &stop, |world| {
+            bar.show(Position::of(world));
+        });
+        (Transport::InProcess, outcome.map_err(AppError::from))
+    } else {
+        let processes = 1 + args.share.coord_procs + args.share.ctrl_procs;
+        let plan = Plan {
+            run: args.run.clone().unwrap_or_else(own_name),
+            scenario: &args.scenario,
+            share: args.share,
+            wait: args.wait,
+            wait_mode: args.wait_mode,
+        };
+        (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
+    };
+    bar.finish();
+    Summary::new(&scenario, transport, outcome?).deliver(args.json.as_deref())
+}
+
+/// A run name nobody else has.
+fn own_name() -> RunName {
+    format!("cz-{}", std::process::id()).parse().expect("letters, a dash and digits are a run name")
+}
+
+/// How far a run is.
+#[derive(Clone, Copy, Debug, serde::Serialize, serde::Deserialize)]
+pub(super) struct Position {
+    pub step: u64,
+    pub arrived: u32,
+    pub departed: u32,
+}
+
+impl Position {
+    pub fn of(world: &World) -> Position {
+        let departed = world.departed();
+        Position { step: world.step(), arrived: world.arrived(), departed }
+    }
+}
+
+/// The progress bar: vehicles when their number is known, simulated time otherwise.
+struct Bar {
+    bar: ProgressBar,
+    by_vehicle: bool,
+    dt_s: f64,
+}
+
+impl Bar {
+    fn new(scenario: &Scenario) -> Bar {
+        let length = scenario.max_vehicles.map_or(scenario.max_time_s as u64, u64::from);
+        // Hidden by itself when stderr is no terminal.
+        let bar = ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr());
+        let style = "{msg} [{wide_bar}] {percent}% {eta}";
+        bar.set_style(ProgressStyle::with_template(style).expect("the template is well formed"));
+        Bar { bar, by_vehicle: scenario.max_vehicles.is_some(), dt_s: scenario.dt_s() }
+    }
+
+    fn show(&self, position: Position) {
+        let time_s = position.step as f64 * self.dt_s;
+        self.bar.set_position(if self.by_vehicle { u64::from(position.departed) } else { time_s as u64 });
+        let inside = position.arrived - position.departed;
+        self.bar.set_message(format!("step {}, {time_s:.0} s, {inside} vehicles", position.step));
+    }
+
+    fn finish(&self) {
+        self.bar.finish_and_clear();
+    }
+}

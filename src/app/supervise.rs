@@ -1,0 +1,271 @@
+//! The supervisor: starts the processes of a run, watches them, and leaves nothing behind.
+
+use super::AppError;
+use super::args::{ScenarioArgs, ShareArgs, WaitArgs};
+use super::run::Position;
+use crate::process::{Outcome, WaitMode};
+use crate::transport::iox::{RunName, RunSpace};
+use crate::world::World;
+use clap::ValueEnum;
+use crossbeam::channel::{Receiver, Sender, select, unbounded};
+use rustix::process::{Pid, Signal, kill_process};
+use serde::{Deserialize, Serialize};
+use std::io::{BufRead, BufReader};
+use std::os::unix::process::ExitStatusExt;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::time::{Duration, Instant};
+
+/// What a supervised world says on its stdout, one JSON object a line.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum WorldLine {
+    Progress(Position),
+    Outcome(Box<Outcome>),
+}
+
+impl WorldLine {
+    pub fn progress(world: &World) -> WorldLine {
+        WorldLine::Progress(Position::of(world))
+    }
+}
+
+/// What to start.
+#[derive(Clone, Debug)]
+pub(super) struct Plan<'a> {
+    pub run: RunName,
+    pub scenario: &'a ScenarioArgs,
+    pub share: ShareArgs,
+    pub wait: WaitArgs,
+    pub wait_mode: WaitMode,
+}
+
+/// How long the others may take to end by themselves once one has failed, and once asked to.
+const GRACE: Duration = Duration::from_secs(2);
+
+/// Starts everything, waits for the end, and returns the world's outcome.
+pub(super) fn supervise(plan: &Plan<'_>, progress: impl FnMut(Position)) -> Result<Outcome, AppError> {
+    // Signals first: from here on a Ctrl-C ends the children in order.
+    let (signal_sender, signals) = unbounded();
+    let mut source =
+        signal_hook::iterator::Signals::new([signal_hook::consts::SIGINT, signal_hook::consts::SIGTERM])
+            .map_err(|e| AppError::Failed(format!("cannot handle signals: {e}")))?;
+    std::thread::spawn(move || {
+        for signal in source.forever() {
+            let _ = signal_sender.send(signal);
+        }
+    });
+
+    // What a killed supervisor of the same run may have left.
+    sweep(&plan.run);
+    let (events, inbox) = unbounded();
+    let mut family = Family { children: Vec::new(), events };
+    let result = family.start(plan).and_then(|()| family.watch(&inbox, &signals, progress));
+    if result.is_err() {
+        family.end(&inbox);
+    }
+    sweep(&plan.run);
+    result
+}
+
+fn sweep(run: &RunName) {
+    // Whoever is still alive in the space keeps it; then there is nothing to be swept.
+    let _ = RunSpace::sweep(run);
+}
+
+#[derive(Debug)]
+enum Event {
+    Line { line: WorldLine },
+    Said { child: usize, line: String },
+    Ended { child: usize, status: std::io::Result<ExitStatus> },
+}
+
+/// The child processes.
+struct Family {
+    children: Vec<Member>,
+    events: Sender<Event>,
+}
+
+struct Member {
+    name: String,
+    pid: u32,
+    running: bool,
+    /// The last thing it said on stderr.
+    last_words: Option<String>,
+}
+
+impl Family {
+    fn start(&mut self, plan: &Plan<'_>) -> Result<(), AppError> {
+        let timeout = |d: Duration| d.as_secs_f64().to_string();
+        let mut common: Vec<String> = ["--run", &plan.run.to_string()].map(str::to_owned).to_vec();
+        common.extend(["--attach-timeout".to_owned(), timeout(plan.wait.attach_timeout)]);
+        common.extend(["--peer-timeout".to_owned(), timeout(plan.wait.peer_timeout)]);
+        let name =
+            |v: Option<clap::builder::PossibleValue>| v.map_or_else(String::new, |v| v.get_name().to_owned());
+        common.extend(["--pin".to_owned(), name(plan.wait.pin.to_possible_value())]);
+        common.extend(["--supervised".to_owned(), std::process::id().to_string()]);
+        let mut world = common.clone();
+        world.extend(["--ctrl-procs".to_owned(), plan.share.ctrl_procs.to_string()]);
+        world.extend(["--coord-procs".to_owned(), plan.share.coord_procs.to_string()]);
+        world.extend(["--wait".to_owned(), name(plan.wait_mode.to_possible_value())]);
+        world.extend(plan.scenario.to_arguments());
+        self.spawn("world".to_owned(), "world", world)?;
+        for (role, command, count) in
+            [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.share.ctrl_procs)]
+        {
+            for index in 0..count {
+                let mut arguments = common.clone();
+                arguments.extend(["--index".to_owned(), index.to_string()]);
+                self.spawn(format!("{role} {index}"), command, arguments)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn spawn(&mut self, name: String, command: &str, arguments: Vec<String>) -> Result<(), AppError> {
+        let failed = |e: std::io::Error| AppError::Failed(format!("cannot start the {name}: {e}"));
+        let program = std::env::current_exe().map_err(failed)?;
+        let mut child = Command::new(program)
+            .arg(command)
+            .args(arguments)
+            .stdin(Stdio::null())
+            .stdout(if command == "world" { Stdio::piped() } else { Stdio::null() })
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(failed)?;
+        let index = self.children.len();
+        self.children.push(Member { name, pid: child.id(), running: true, last_words: None });
+        self.listen(index, &mut child);
+        Ok(())
+    }
+
+    /// A thread per child passes on what it says and, after its last word, how it ended.
+    fn listen(&self, child_index: usize, child: &mut Child) {
+        let stderr = child.stderr.take();
+        let stdout = child.stdout.take();
+        let pid = child.id();
+        let events = self.events.clone();
+        let says = events.clone();
+        let lines = std::thread::spawn(move || {
+            for line in stdout.into_iter().flat_map(|s| BufReader::new(s).lines().map_while(Result::ok)) {
+                if let Ok(line) = serde_json::from_str(&line) {
+                    let _ = says.send(Event::Line { line });
+                }
+            }
+        });
+        std::thread::spawn(move || {
+            for line in stderr.into_iter().flat_map(|s| BufReader::new(s).lines().map_while(Result::ok)) {
+                let _ = events.send(Event::Said { child: child_index, line });
+            }
+            let _ = lines.join();
+            let status = wait_for(pid);
+            let _ = events.send(Event::Ended { child: child_index, status });
+        });
+    }
+
+    fn watch(
+        &mut self,
+        inbox: &Receiver<Event>,
+        signals: &Receiver<i32>,
+        mut progress: impl FnMut(Position),
+    ) -> Result<Outcome, AppError> {
+        let mut outcome = None;
+        let mut failure: Option<(AppError, Instant)> = None;
+        while self.children.iter().any(|c| c.running) {
+            let patience = match &failure {
+                // The others notice within moments; what they say on the way out is worth having.
+                Some((_, since)) => GRACE.saturating_sub(since.elapsed()),
+                None => Duration::from_secs(3600),
+            };
+            select! {
+                recv(signals) -> signal => {
+                    let name = if signal == Ok(signal_hook::consts::SIGINT) { "SIGINT" } else { "SIGTERM" };
+                    return Err(AppError::Interrupted(format!("interrupted by {name}; the run was ended")));
+                }
+                recv(inbox) -> event => match event.expect("the family holds a sender") {
+                    Event::Line { line: WorldLine::Progress(position) } => progress(position),
+                    Event::Line { line: WorldLine::Outcome(result) } => outcome = Some(*result),
+                    Event::Said { child, line } => self.children[child].last_words = Some(line),
+                    Event::Ended { child, status } => {
+                        let member = &mut self.children[child];
+                        member.running = false;
+                        if let Some(how) = describe_failure(&status) {
+                            let text = message(member, &how);
+                            match &mut failure {
+                                None => failure = Some((AppError::Failed(text), Instant::now())),
+                                Some((AppError::Failed(all), _)) => {
+                                    all.push_str("\n  ");
+                                    all.push_str(&text);
+                                }
+                                Some(_) => {}
+                            }
+                        }
+                    }
+                },
+                default(patience) => if let Some((error, _)) = failure {
+                    return Err(error);
+                },
+            }
+        }
+        match (failure, outcome) {
+            (Some((error, _)), _) => Err(error),
+            (None, Some(outcome)) => Ok(outcome),
+            (None, None) => Err(AppError::Failed("the world ended without results".to_owned())),
+        }
+    }
+
+    /// Ends whoever still runs: asks first, insists after a grace period.
+    fn end(&mut self, inbox: &Receiver<Event>) {
+        for signal in [Signal::TERM, Signal::KILL] {
+            for child in self.children.iter().filter(|c| c.running) {
+                if let Some(pid) = Pid::from_raw(child.pid as i32) {
+                    let _ = kill_process(pid, signal);
+                }
+            }
+            let deadline = Instant::now() + GRACE;
+            while self.children.iter().any(|c| c.running) {
+                match inbox.recv_deadline(deadline) {
+                    Ok(Event::Ended { child, .. }) => self.children[child].running = false,
+                    Ok(_) => {}
+                    Err(_) => break,
+                }
+            }
+        }
+    }
+}
+
+/// Reaps a child by its process id (its handle stays with the thread that started it).
+fn wait_for(pid: u32) -> std::io::Result<ExitStatus> {
+    use rustix::process::{WaitOptions, waitpid};
+    let pid = Pid::from_raw(pid as i32);
+    loop {
+        match waitpid(pid, WaitOptions::empty()) {
+            Ok(Some((_, status))) => return Ok(ExitStatus::from_raw(status.as_raw())),
+            Ok(None) | Err(rustix::io::Errno::INTR) => {}
+            Err(error) => return Err(error.into()),
+        }
+    }
+}
+
+/// How a child failed, if it did.
+fn describe_failure(status: &std::io::Result<ExitStatus>) -> Option<String> {
+    match status {
+        Ok(status) if status.success() => None,
+        Ok(status) => Some(match (status.signal(), status.code()) {
+            (Some(signal), _) => {
+                let name = signal_hook::low_level::signal_name(signal).unwrap_or("unknown");
+                format!("was killed by signal {signal} ({name})")
+            }
+            (None, Some(code)) => format!("ended with code {code}"),
+            (None, None) => "ended in an unknown way".to_owned(),
+        }),
+        Err(error) => Some(format!("could not be waited for: {error}")),
+    }
+}
+
+fn message(member: &Member, how: &str) -> String {
+    let Member { name, pid, last_words, .. } = member;
+    match last_words {
+        Some(words) => format!("{name} (process {pid}) {how}: {}", words.trim_start_matches("cz: ")),
+        None => format!("{name} (process {pid}) {how}"),
+    }
+}

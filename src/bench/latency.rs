@@ -1,0 +1,279 @@
+//! `cz bench latency`: one step, next to the floor beneath it and to what one would write instead.
+
+use super::machine::Machine;
+use super::peer::{PATIENCE, receive};
+use super::shared_word::SharedWords;
+use super::socket::{Connection, Stream};
+use super::{BenchError, io};
+use crate::coordination::Coordinator;
+use crate::lockstep::{CoordinatorDriver, CoordinatorPorts, Identity, Progress, WorldDriver, WorldPorts};
+use crate::process::{
+    Affinity, Outcome, Percentiles, Placement, StopFlag, new_histogram, place, run_in_process, unplaced,
+};
+use crate::scenario::Scenario;
+use crate::transport::iox::{RunName, RunSpace, ServiceLimits};
+use crate::transport::memory::{MemoryInbox, MemoryService};
+use crate::transport::{Loan, Outbox};
+use crate::world::World;
+use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use serde::Serialize;
+use std::net::TcpListener;
+use std::os::unix::net::UnixListener;
+use std::process::Child;
+use std::sync::Arc;
+use std::time::Instant;
+
+/// What to measure, and how to start the other processes.
+pub struct LatencyOptions<'a> {
+    /// The scenario whose steps are measured.
+    pub scenario: Arc<Scenario>,
+    /// Round trips of the floor and of iceoryx2.
+    pub round_trips: u64,
+    /// Starts this program as the other process of a measurement.
+    pub start_peer: &'a dyn Fn(&[String]) -> std::io::Result<Child>,
+    /// Runs the scenario in three processes.
+    pub run_processes: &'a dyn Fn() -> Result<Outcome, String>,
+}
+
+/// The results; the JSON keys are a contract. All times in ns.
+#[derive(Clone, Debug, Serialize)]
+pub struct LatencyReport {
+    /// Where it was measured.
+    pub machine: Machine,
+    /// Scenario name.
+    pub scenario: String,
+    /// Mean number of records in a state frame.
+    pub mean_records: f64,
+    /// A word of shared memory there and back.
+    pub floor_round_trip: Percentiles,
+    /// A state frame there and a command frame back over iceoryx2, nothing computed.
+    pub iceoryx2_round_trip: Percentiles,
+    /// A step with all roles in one process; steps without coordination.
+    pub in_process_step: Percentiles,
+    /// The same for steps in which the coordinator acts.
+    pub in_process_event_step: Percentiles,
+    /// A step with three processes; steps without coordination.
+    pub steady_step: Percentiles,
+    /// The same for steps in which the coordinator acts.
+    pub event_step: Percentiles,
+    /// A step (without coordination) over a unix socket, two processes.
+    pub unix_socket_step: Percentiles,
+    /// The same over TCP on the loopback interface.
+    pub tcp_step: Percentiles,
+    /// `steady_step.p50 / (in_process_step.p50 + iceoryx2_round_trip.p50)`.
+    pub ratio_to_parts: f64,
+    /// `unix_socket_step.p50 / steady_step.p50`.
+    pub ratio_unix: f64,
+    /// `tcp_step.p50 / steady_step.p50`.
+    pub ratio_tcp: f64,
+    /// `steady_step.p99 / steady_step.p50`.
+    pub ratio_tail: f64,
+}
+
+/// Measures everything, one after the other.
+pub fn latency(options: &LatencyOptions<'_>) -> Result<LatencyReport, BenchError> {
+    let machine = Machine::here();
+    let scenario = &options.scenario;
+    let affinity = Affinity::current();
+    place(Placement::Auto, Role::World, 0);
+    let in_process = run_in_process(scenario, 1, 1, &StopFlag::none(), |_| {})?;
+    let mean_records = mean_records(scenario)?;
+    let floor = floor(options, affinity.as_ref())?;
+    let iceoryx2 = iceoryx2(options, affinity.as_ref(), mean_records.round() as usize)?;
+    let processes = unplaced(affinity.as_ref(), options.run_processes).map_err(BenchError::Run)?;
+    let unix = socket_step(options, affinity.as_ref(), SocketKind::Unix)?;
+    let tcp = socket_step(options, affinity.as_ref(), SocketKind::Tcp)?;
+    for (name, hash) in
+        [("three processes", processes.world.state_hash), ("unix socket", unix.1), ("tcp", tcp.1)]
+    {
+        if hash != in_process.world.state_hash {
+            let expected = in_process.world.state_hash;
+            return Err(BenchError::Disagreement(format!(
+                "state hash over {name} is {hash:016x}, in one process {expected:016x}"
+            )));
+        }
+    }
+    let (unix, tcp) = (unix.0, tcp.0);
+    let ratio = |a: u64, b: u64| a as f64 / b.max(1) as f64;
+    Ok(LatencyReport {
+        machine,
+        scenario: scenario.name.clone(),
+        mean_records,
+        floor_round_trip: floor,
+        iceoryx2_round_trip: iceoryx2,
+        in_process_step: in_process.steady_ns,
+        in_process_event_step: in_process.event_ns,
+        steady_step: processes.steady_ns,
+        event_step: processes.event_ns,
+        unix_socket_step: unix,
+        tcp_step: tcp,
+        ratio_to_parts: ratio(processes.steady_ns.p50, in_process.steady_ns.p50 + iceoryx2.p50),
+        ratio_unix: ratio(unix.p50, processes.steady_ns.p50),
+        ratio_tcp: ratio(tcp.p50, processes.steady_ns.p50),
+        ratio_tail: ratio(processes.steady_ns.p99, processes.steady_ns.p50),
+    })
+}
+
+fn mean_records(scenario: &Arc<Scenario>) -> Result<f64, BenchError> {
+    let mut run = crate::lockstep::in_process::InProcess::new(scenario, 1, 1);
+    let (mut records, mut steps) = (0usize, 0usize);
+    while run.step()? {
+        records += run.world().record_count();
+        steps += 1;
+    }
+    Ok(records as f64 / steps.max(1) as f64)
+}
+
+/// A child that is killed when the measurement does not get to its end.
+struct Peer(Child);
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        let deadline = Instant::now() + std::time::Duration::from_millis(500);
+        while matches!(self.0.try_wait(), Ok(None)) && Instant::now() < deadline {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn start(
+    options: &LatencyOptions<'_>,
+    affinity: Option<&Affinity>,
+    arguments: &[&str],
+) -> Result<Peer, BenchError> {
+    let arguments: Vec<String> = arguments.iter().map(|&a| a.to_owned()).collect();
+    unplaced(affinity, || (options.start_peer)(&arguments)).map(Peer).map_err(io("start the other process"))
+}
+
+fn floor(options: &LatencyOptions<'_>, affinity: Option<&Affinity>) -> Result<Percentiles, BenchError> {
+    let path = std::path::PathBuf::from(format!("/dev/shm/cz_bench_{}", std::process::id()));
+    let words = SharedWords::open(&path)?;
+    let count = options.round_trips.to_string();
+    let result = start(options, affinity, &["word", &path.to_string_lossy(), &count]).and_then(|_peer| {
+        let mut histogram = new_histogram();
+        for i in 1..=options.round_trips {
+            let start = Instant::now();
+            words.round_trip(i)?;
+            let _ = histogram.record(start.elapsed().as_nanos() as u64);
+        }
+        Ok(Percentiles::of(&histogram))
+    });
+    let _ = std::fs::remove_file(path);
+    result
+}
+
+fn iceoryx2(
+    options: &LatencyOptions<'_>,
+    affinity: Option<&Affinity>,
+    records: usize,
+) -> Result<Percentiles, BenchError> {
+    let run: RunName =
+        format!("bench-{}", std::process::id()).parse().expect("letters, a dash and digits are a run name");
+    let space = RunSpace::enter(&run)?;
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
+    let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits)?;
+    let mut inbox = command.inbox()?;
+    let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits)?;
+    let mut outbox = state.outbox(records.max(1))?;
+    let count = options.round_trips.to_string();
+    let _peer = start(options, affinity, &["iceoryx2", &run.to_string(), &count])?;
+    let mut histogram = new_histogram();
+    let record = VehicleState::default();
+    let deadline = Instant::now() + PATIENCE;
+    let mut done = 0;
+    while done <= options.round_trips {
+        let start = Instant::now();
+        let loan = outbox.loan(frames::FrameHeader::default(), records, |slots| {
+            (0..records).for_each(|_| slots.push(record));
+        })?;
+        let reached = loan.send()?;
+        if done == options.round_trips {
+            break; // this one only tells the other that it may go
+        }
+        if reached == 0 {
+            if Instant::now() > deadline {
+                return Err(BenchError::Peer);
+            }
+            continue; // it is not there yet
+        }
+        drop(receive(&mut inbox)?);
+        let _ = histogram.record(start.elapsed().as_nanos() as u64);
+        done += 1;
+    }
+    Ok(Percentiles::of(&histogram))
+}
+
+#[derive(Clone, Copy)]
+enum SocketKind {
+    Unix,
+    Tcp,
+}
+
+/// World and coordinator here, the controller in another process, frames over a socket.
+fn socket_step(
+    options: &LatencyOptions<'_>,
+    affinity: Option<&Affinity>,
+    kind: SocketKind,
+) -> Result<(Percentiles, u64), BenchError> {
+    let scenario = &options.scenario;
+    let (stream, _peer) = match kind {
+        SocketKind::Unix => {
+            let path = std::env::temp_dir().join(format!("cz-bench-{}.sock", std::process::id()));
+            let listener = UnixListener::bind(&path).map_err(io("bind a unix socket"))?;
+            let peer = start(options, affinity, &["unix", &path.to_string_lossy()]);
+            let accepted = peer.and_then(|peer| {
+                let (stream, _) = listener.accept().map_err(io("accept"))?;
+                Ok((Stream::Unix(stream), peer))
+            });
+            let _ = std::fs::remove_file(path);
+            accepted?
+        }
+        SocketKind::Tcp => {
+            let listener = TcpListener::bind(("127.0.0.1", 0)).map_err(io("bind a TCP socket"))?;
+            let port = listener.local_addr().map_err(io("read the port"))?.port();
+            let peer = start(options, affinity, &["tcp", &port.to_string()])?;
+            let (stream, _) = listener.accept().map_err(io("accept"))?;
+            stream.set_nodelay(true).map_err(io("configure the socket"))?;
+            (Stream::Tcp(stream), peer)
+        }
+    };
+    let connection = Connection::new(stream);
+    let mut coordinator_state: MemoryService<VehicleState> =
+        MemoryService::new(frames::SERVICE_COORDINATOR_STATE_PREFIX);
+    let mut summaries: MemoryService<ZoneSummary> = MemoryService::new(frames::SERVICE_SUMMARY_PREFIX);
+    let zones = 0..scenario.network.zones.len() as u32;
+    let coordinator_ports = CoordinatorPorts::<_, MemoryInbox<ZoneSummary>, _, _> {
+        state: coordinator_state.inbox(),
+        summaries: summaries.inbox(),
+        neighbours:
+            Vec::<(u16, std::ops::Range<u32>, crate::transport::memory::MemoryOutbox<ZoneSummary>)>::new(),
+        coordination: connection.outbox::<Assignment>(),
+    };
+    let identity = Identity { run_id: 1, role: Role::Coordinator, index: 0, generation: 0 };
+    let mut coordinator =
+        CoordinatorDriver::new(Coordinator::new(scenario.clone(), zones), coordinator_ports, identity, 1);
+    let ports = WorldPorts {
+        state: connection.outbox::<VehicleState>(),
+        coordinator_states: vec![coordinator_state.outbox()],
+        command: connection.inbox::<VehicleCommand>(),
+    };
+    let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, 1, 1);
+    let mut steady = new_histogram();
+    let mut steps = 0;
+    loop {
+        let start = Instant::now();
+        if world.advance()? == Progress::Finished {
+            return Ok((Percentiles::of(&steady), world.world().state_hash()));
+        }
+        while coordinator.advance()? == Progress::Advanced {}
+        if world.advance()? == Progress::Finished {
+            return Ok((Percentiles::of(&steady), world.world().state_hash()));
+        }
+        steps += 1;
+        if steps > 500 && !world.was_event() {
+            let _ = steady.record(start.elapsed().as_nanos() as u64);
+        }
+    }
+}

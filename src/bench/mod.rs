@@ -1,0 +1,59 @@
+//! Measurements a user runs on their own machine: `cz bench`.
+
+mod corridors;
+mod latency;
+mod machine;
+mod peer;
+mod scale;
+mod shared_word;
+mod socket;
+mod solver;
+
+pub use corridors::corridors;
+pub use latency::{LatencyOptions, LatencyReport, latency};
+pub use machine::Machine;
+pub use peer::{PeerKind, run_peer};
+pub use scale::{ScaleOptions, ScaleReport, scale};
+pub use solver::{SolverReport, solver};
+
+use crate::lockstep::LockstepError;
+use crate::process::ProcessError;
+use crate::transport::iox::SpaceError;
+
+/// Why a measurement could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum BenchError {
+    /// A run of the measurement failed.
+    #[error(transparent)]
+    Process(#[from] ProcessError),
+    /// A step failed.
+    #[error(transparent)]
+    Lockstep(#[from] LockstepError),
+    /// Shared memory failed.
+    #[error(transparent)]
+    Space(#[from] SpaceError),
+    /// A frame could not be exchanged.
+    #[error(transparent)]
+    Transport(#[from] crate::transport::TransportError),
+    /// A file or socket failed.
+    #[error("{what}: {source}")]
+    Io {
+        /// What was attempted.
+        what: &'static str,
+        /// Why it failed.
+        source: std::io::Error,
+    },
+    /// The other process did not do its part.
+    #[error("the other process of the measurement ended early or does not answer")]
+    Peer,
+    /// A supervised run failed.
+    #[error("{0}")]
+    Run(String),
+    /// Two variants that must agree do not.
+    #[error("{0}")]
+    Disagreement(String),
+}
+
+fn io(what: &'static str) -> impl Fn(std::io::Error) -> BenchError {
+    move |source| BenchError::Io { what, source }
+}

@@ -1,0 +1,280 @@
+//! How participants join a run, on both sides.
+
+use super::peers::is_alive;
+use super::{Peer, Peers, ProcessError, StopFlag, WorldOptions};
+use crate::scenario::{Scenario, decode, scenario_hash};
+use crate::transport::TransportError;
+use crate::transport::iox::{AttachDesk, AttachLine, RunName, RunSpace, SpaceError};
+use ipc_schemas::{self as frames, AttachReply, AttachRequest, Role, schema_hash};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// Time between two looks for an answer.
+const LOOK: Duration = Duration::from_millis(2);
+/// Time after which an unanswered request is repeated.
+const REPEAT: Duration = Duration::from_millis(100);
+
+/// What a participant says of itself when it joins.
+#[derive(Clone, Copy, Debug)]
+pub struct Joining {
+    /// Coordinator or controller.
+    pub role: Role,
+    /// Index wanted among the processes of the role.
+    pub index: Option<u16>,
+    /// Hash of the scenario it was given, if it was given one.
+    pub scenario_hash: Option<u64>,
+    /// How long to wait for the world.
+    pub timeout: Duration,
+}
+
+/// A participant that has been let in, before it is ready.
+#[derive(Debug)]
+pub struct Attachment {
+    /// What the world said.
+    pub reply: AttachReply,
+    /// The scenario of the run.
+    pub scenario: Arc<Scenario>,
+    line: AttachLine,
+    request: AttachRequest,
+    run: RunName,
+    joining: Joining,
+}
+
+impl Attachment {
+    /// Joins the run whose space this is.
+    pub fn join(
+        space: &RunSpace,
+        run: &RunName,
+        joining: Joining,
+        stop: &StopFlag,
+    ) -> Result<Attachment, ProcessError> {
+        let deadline = Instant::now() + joining.timeout;
+        let no_world =
+            || ProcessError::NoWorld { run: run.to_string(), seconds: joining.timeout.as_secs_f64() };
+        let line = loop {
+            match space.open_attach_line() {
+                Ok(line) => break line,
+                Err(SpaceError::NoService { .. }) => pause(deadline, stop, &no_world)?,
+                Err(error) => return Err(error.into()),
+            }
+        };
+        let mut instance = [0u8; 8];
+        // The instance only tells simultaneous joiners apart; the time will do where there is no entropy.
+        if rustix::rand::getrandom(&mut instance, rustix::rand::GetRandomFlags::NONBLOCK).is_err() {
+            instance = (std::process::id() as u64).to_le_bytes();
+        }
+        let request = AttachRequest {
+            instance: u64::from_le_bytes(instance),
+            schema_hash: schema_hash(),
+            scenario_hash: joining.scenario_hash.unwrap_or(frames::ANY_SCENARIO),
+            process_id: std::process::id(),
+            role: joining.role as u16,
+            wanted_index: joining.index.unwrap_or(frames::ANY_INDEX),
+            phase: frames::ATTACH_JOIN,
+            index: 0,
+        };
+        let (reply, bytes) = exchange(&line, request, deadline, stop, &no_world)?;
+        if reply.status != frames::ATTACH_ACCEPTED {
+            let reason = refusal(&request, &reply);
+            return Err(ProcessError::Refused { run: run.to_string(), role: joining.role, reason });
+        }
+        let scenario = Arc::new(decode(&bytes)?);
+        Ok(Attachment { reply, scenario, line, request, run: run.clone(), joining })
+    }
+
+    /// Tells the world that all ends of the services are open. After this the run may begin.
+    pub fn ready(&self, stop: &StopFlag) -> Result<(), ProcessError> {
+        let request = AttachRequest { phase: frames::ATTACH_READY, index: self.reply.index, ..self.request };
+        let seconds = self.joining.timeout.as_secs_f64();
+        let no_world = || ProcessError::NoWorld { run: self.run.to_string(), seconds };
+        let deadline = Instant::now() + self.joining.timeout;
+        exchange(&self.line, request, deadline, stop, &no_world).map(|_| ())
+    }
+
+    /// The world as a peer.
+    pub fn world(&self) -> Peers {
+        Peers(vec![Peer { role: Role::World, index: 0, process_id: self.reply.world_process_id }])
+    }
+}
+
+/// Repeats a request until its reply comes.
+fn exchange(
+    line: &AttachLine,
+    request: AttachRequest,
+    deadline: Instant,
+    stop: &StopFlag,
+    too_late: &dyn Fn() -> ProcessError,
+) -> Result<(AttachReply, Vec<u8>), ProcessError> {
+    let mut repeat_at = Instant::now();
+    loop {
+        if Instant::now() >= repeat_at {
+            line.request(request)?;
+            repeat_at = Instant::now() + REPEAT;
+        }
+        while let Some(frame) = line.next_reply()? {
+            if frame.reply().instance == request.instance {
+                return Ok((*frame.reply(), frame.scenario().to_vec()));
+            }
+        }
+        pause(deadline, stop, too_late)?;
+    }
+}
+
+fn pause(
+    deadline: Instant,
+    stop: &StopFlag,
+    too_late: &dyn Fn() -> ProcessError,
+) -> Result<(), ProcessError> {
+    if stop.is_set() {
+        return Err(ProcessError::Interrupted { step: None });
+    }
+    if Instant::now() >= deadline {
+        return Err(too_late());
+    }
+    std::thread::sleep(LOOK);
+    Ok(())
+}
+
+fn refusal(request: &AttachRequest, reply: &AttachReply) -> String {
+    match reply.status {
+        frames::ATTACH_OTHER_SCHEMA => format!(
+            "its frames have schema {:016x}, the world's have {:016x}; build both from the same version",
+            request.schema_hash, reply.schema_hash
+        ),
+        frames::ATTACH_OTHER_SCENARIO => format!(
+            "it was given scenario {:016x}, the world runs {:016x}; give both the same, or this one none",
+            request.scenario_hash, reply.scenario_hash
+        ),
+        frames::ATTACH_NO_ROOM if request.wanted_index != frames::ANY_INDEX => {
+            format!("index {} is taken or beyond the number the world expects", request.wanted_index)
+        }
+        frames::ATTACH_NO_ROOM => {
+            let (c, k) = (reply.coordinators, reply.controllers);
+            format!("all places are taken; the run has {c} coordinator and {k} controller processes")
+        }
+        frames::ATTACH_BAD_ROLE => format!("it asked for role {}, which nobody has", request.role),
+        other => format!("status {other}"),
+    }
+}
+
+/// The world's side: a seat for each participant.
+#[derive(Debug)]
+pub(super) struct Reception {
+    desk: AttachDesk,
+    run_id: u64,
+    scenario: Vec<u8>,
+    scenario_hash: u64,
+    waiting: u32,
+    coordinators: Vec<Option<Seat>>,
+    controllers: Vec<Option<Seat>>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Seat {
+    instance: u64,
+    process_id: u32,
+    ready: bool,
+}
+
+impl Reception {
+    pub(super) fn open(
+        space: &RunSpace,
+        scenario: &Scenario,
+        run_id: u64,
+        options: &WorldOptions,
+    ) -> Result<Reception, SpaceError> {
+        let WorldOptions { coordinators, controllers, .. } = *options;
+        let bytes = crate::scenario::encode(scenario);
+        Ok(Reception {
+            desk: space.create_attach_desk((coordinators + controllers) as usize, bytes.len())?,
+            run_id,
+            scenario_hash: scenario_hash(scenario),
+            scenario: bytes,
+            waiting: options.wait.code(),
+            coordinators: vec![None; coordinators as usize],
+            controllers: vec![None; controllers as usize],
+        })
+    }
+
+    /// Answers what has come.
+    pub(super) fn serve(&mut self) -> Result<(), TransportError> {
+        while let Some(request) = self.desk.next_request()? {
+            let (status, index) = self.judge(&request);
+            let reply = AttachReply {
+                instance: request.instance,
+                run_id: self.run_id,
+                schema_hash: schema_hash(),
+                scenario_hash: self.scenario_hash,
+                first_step: 0,
+                status,
+                world_process_id: std::process::id(),
+                generation: 0,
+                index,
+                coordinators: self.coordinators.len() as u32,
+                controllers: self.controllers.len() as u32,
+                waiting: self.waiting,
+                reserved: 0,
+            };
+            let scenario = if status == frames::ATTACH_ACCEPTED { &self.scenario[..] } else { &[] };
+            self.desk.reply(reply, scenario)?;
+        }
+        Ok(())
+    }
+
+    fn judge(&mut self, request: &AttachRequest) -> (u32, u32) {
+        if request.schema_hash != schema_hash() {
+            return (frames::ATTACH_OTHER_SCHEMA, 0);
+        }
+        if request.scenario_hash != frames::ANY_SCENARIO && request.scenario_hash != self.scenario_hash {
+            return (frames::ATTACH_OTHER_SCENARIO, 0);
+        }
+        let seats = match Role::from_code(request.role) {
+            Some(Role::Coordinator) => &mut self.coordinators,
+            Some(Role::Controller) => &mut self.controllers,
+            _ => return (frames::ATTACH_BAD_ROLE, 0),
+        };
+        let own = seats.iter().position(|s| s.is_some_and(|s| s.instance == request.instance));
+        let free = |seat: &Option<Seat>| seat.is_none_or(|s| !is_alive(s.process_id));
+        let place = own.or_else(|| match request.wanted_index {
+            frames::ANY_INDEX => seats.iter().position(free),
+            wanted => {
+                let wanted = usize::from(wanted);
+                seats.get(wanted).is_some_and(free).then_some(wanted)
+            }
+        });
+        let Some(place) = place else { return (frames::ATTACH_NO_ROOM, 0) };
+        let ready = request.phase == frames::ATTACH_READY && own.is_some();
+        seats[place] = Some(Seat {
+            instance: request.instance,
+            process_id: request.process_id,
+            ready: ready || seats[place].is_some_and(|s| s.instance == request.instance && s.ready),
+        });
+        (frames::ATTACH_ACCEPTED, place as u32)
+    }
+
+    /// The first participant that is not ready, or died since: its role and index.
+    pub(super) fn first_missing(&self) -> Option<(Role, usize)> {
+        let there = |seat: &Seat| seat.ready && is_alive(seat.process_id);
+        let missing = |seats: &[Option<Seat>]| seats.iter().position(|s| !s.as_ref().is_some_and(there));
+        missing(&self.coordinators)
+            .map(|i| (Role::Coordinator, i))
+            .or_else(|| missing(&self.controllers).map(|i| (Role::Controller, i)))
+    }
+
+    /// All participants.
+    pub(super) fn peers(&self) -> Peers {
+        let peers = |role, seats: &[Option<Seat>]| {
+            let seats: Vec<_> = seats.iter().flatten().copied().collect();
+            seats.into_iter().zip(0..).map(move |(seat, index)| Peer {
+                role,
+                index,
+                process_id: seat.process_id,
+            })
+        };
+        Peers(
+            peers(Role::Coordinator, &self.coordinators)
+                .chain(peers(Role::Controller, &self.controllers))
+                .collect(),
+        )
+    }
+}

@@ -1,0 +1,114 @@
+//! The processes of a run: thin shells that give the pure roles a clock, signals and a transport.
+
+mod attach;
+mod participant;
+mod peers;
+mod placement;
+mod stop;
+mod wait;
+mod world;
+
+pub use attach::{Attachment, Joining};
+pub use participant::{run_controller, run_coordinator};
+pub use peers::{Peer, Peers};
+pub use placement::{Affinity, Placement, place, unplaced};
+pub use stop::StopFlag;
+pub use wait::{Patience, WaitMode, Waiter};
+pub use world::{
+    LatencyUs, Outcome, Percentiles, WorldOptions, check_cores, new_histogram, run_in_process, run_world,
+};
+
+use crate::lockstep::{Awaited, LockstepError};
+use crate::scenario::DecodeError;
+use crate::transport::TransportError;
+use crate::transport::iox::SpaceError;
+
+/// Why a process of a run ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum ProcessError {
+    /// The shared-memory space failed.
+    #[error(transparent)]
+    Space(#[from] SpaceError),
+    /// A frame could not be sent or received.
+    #[error(transparent)]
+    Transport(#[from] TransportError),
+    /// The protocol was broken.
+    #[error(transparent)]
+    Lockstep(#[from] LockstepError),
+    /// SIGINT or SIGTERM.
+    #[error("interrupted{}", .step.map(|s| format!(" at step {s}")).unwrap_or_default())]
+    Interrupted {
+        /// Step at that time, once the run had begun.
+        step: Option<u64>,
+    },
+    /// Another world is running under that name.
+    #[error("run {run} is active already; choose another name with --run")]
+    AlreadyActive {
+        /// Run name.
+        run: String,
+    },
+    /// Nobody answered an attach request.
+    #[error("no world of run {run} answered within {seconds} s; start one with `cz-world --run {run}`")]
+    NoWorld {
+        /// Run name.
+        run: String,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// The world did not let a participant in.
+    #[error("the world of run {run} refused this {role}: {reason}")]
+    Refused {
+        /// Run name.
+        run: String,
+        /// Own role.
+        role: ipc_schemas::Role,
+        /// Why.
+        reason: String,
+    },
+    /// Participants are missing at the start.
+    #[error("waited {seconds} s for {missing} of run {run}; start it with `{command} --run {run}`")]
+    Missing {
+        /// Run name.
+        run: String,
+        /// Who.
+        missing: String,
+        /// Program that would start one.
+        command: &'static str,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// There are more processes than cores to spin on.
+    #[error(
+        "waiting by spinning needs a core for each of the {processes} processes, and there are {cores}; use --wait hybrid"
+    )]
+    TooFewCores {
+        /// Processes of the run.
+        processes: usize,
+        /// Cores this process may use.
+        cores: usize,
+    },
+    /// A frame did not come in time.
+    #[error("waited {seconds} s for {awaited}")]
+    Timeout {
+        /// What was waited for.
+        awaited: Awaited,
+        /// How long.
+        seconds: f64,
+    },
+    /// A process of the run has died.
+    #[error("{who} (process {process_id}) has died; this one was waiting for {awaited}")]
+    PeerGone {
+        /// Who.
+        who: String,
+        /// Its process id.
+        process_id: u32,
+        /// What was waited for.
+        awaited: Awaited,
+    },
+    /// The scenario that came with the attach reply cannot be read.
+    #[error("the scenario sent by the world cannot be read: {0}")]
+    Scenario(#[from] DecodeError),
+    /// Signal handlers could not be installed.
+    #[error("cannot handle signals: {0}")]
+    Signals(std::io::Error),
+}

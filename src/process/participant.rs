@@ -1,0 +1,98 @@
+//! The coordinator and controller processes.
+
+use super::world::{controller_ropes, coordinator_rope, expected_vehicles};
+use super::{Attachment, Joining, Patience, Placement, ProcessError, StopFlag, WaitMode, Waiter, place};
+use crate::control::ControllerPool;
+use crate::coordination::Coordinator;
+use crate::lockstep::{ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity};
+use crate::scenario::share::{neighbour_coordinators, zones_of};
+use crate::transport::iox::{RunName, RunSpace};
+use ipc_schemas::{self as frames, AttachReply, Role};
+use std::time::Duration;
+
+/// How long a coordinator waits for the next event. Events may be far apart in a paced run; a world that
+/// dies is noticed at once, and this bounds the wait for one that hangs.
+const BETWEEN_EVENTS: Duration = Duration::from_secs(3600);
+
+/// Runs a coordinator process to the end of the run.
+pub fn run_coordinator(
+    run: &RunName,
+    joining: Joining,
+    peer_timeout: Duration,
+    placement: Placement,
+    stop: &StopFlag,
+) -> Result<(), ProcessError> {
+    let space = RunSpace::enter(run)?;
+    let attachment = Attachment::join(&space, run, joining, stop)?;
+    let AttachReply { index, coordinators, controllers, .. } = attachment.reply;
+    let scenario = &attachment.scenario;
+    let zones = scenario.network.zones.len() as u32;
+    let mask = neighbour_coordinators(&scenario.network, coordinators)[index as usize];
+    let own = |prefix: &str| format!("{prefix}{index}");
+    let wait = WaitMode::from_code(attachment.reply.waiting);
+    let bell = wait.has_bell(Role::Coordinator).then(|| space.bell(&own(frames::BELL_COORDINATOR_PREFIX)));
+    place(placement, Role::Coordinator, index);
+    let neighbours = (0..coordinators)
+        .filter(|n| mask >> n & 1 == 1)
+        .map(|n| {
+            let service = space.open(&format!("{}{n}", frames::SERVICE_SUMMARY_PREFIX))?;
+            let owned = zones_of(zones, n, coordinators);
+            let expected = owned.len();
+            Ok((n as u16, owned, service.outbox(expected)?.ringing(coordinator_rope(&space, wait, n))))
+        })
+        .collect::<Result<_, ProcessError>>()?;
+    let ports = CoordinatorPorts {
+        state: space.open(&own(frames::SERVICE_COORDINATOR_STATE_PREFIX))?.inbox()?,
+        summaries: space.open(&own(frames::SERVICE_SUMMARY_PREFIX))?.inbox()?,
+        neighbours,
+        // Two constraints per vehicle at most while zones only merge.
+        coordination: space
+            .open(frames::SERVICE_COORDINATION)?
+            .outbox(2 * expected_vehicles(scenario))?
+            .ringing(controller_ropes(&space, wait, controllers)),
+    };
+    let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
+    let identity = identity(&attachment.reply, Role::Coordinator);
+    let mut driver = CoordinatorDriver::new(role, ports, identity, controllers);
+    attachment.ready(stop)?;
+    let hot_processes = 1 + controllers as usize;
+    let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
+    Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world()).drive(|| driver.advance())
+}
+
+/// Runs a controller process with the built-in law to the end of the run.
+pub fn run_controller(
+    run: &RunName,
+    joining: Joining,
+    peer_timeout: Duration,
+    placement: Placement,
+    stop: &StopFlag,
+) -> Result<(), ProcessError> {
+    let space = RunSpace::enter(run)?;
+    let attachment = Attachment::join(&space, run, joining, stop)?;
+    let AttachReply { index, controllers, first_step, .. } = attachment.reply;
+    let wait = WaitMode::from_code(attachment.reply.waiting);
+    let own_bell = || space.bell(&format!("{}{index}", frames::BELL_CONTROLLER_PREFIX));
+    let bell = wait.has_bell(Role::Controller).then(own_bell).flatten();
+    place(placement, Role::Controller, index);
+    let scenario = &attachment.scenario;
+    let zones = scenario.network.zones.len() as u32;
+    let ports = ControllerPorts {
+        state: space.open(frames::SERVICE_STATE)?.inbox()?,
+        coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
+        command: space
+            .open(frames::SERVICE_COMMAND)?
+            .outbox(expected_vehicles(scenario))?
+            .ringing(wait.has_bell(Role::World).then(|| space.bell_rope(frames::BELL_WORLD)).flatten()),
+    };
+    let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, controllers));
+    let identity = identity(&attachment.reply, Role::Controller);
+    let mut driver = ControllerDriver::new(role, ports, identity, first_step);
+    attachment.ready(stop)?;
+    let patience = Patience::of(wait, Role::Controller, 1 + controllers as usize, peer_timeout);
+    Waiter::new(patience, bell, stop.clone(), attachment.world()).drive(|| driver.advance())
+}
+
+fn identity(reply: &AttachReply, role: Role) -> Identity {
+    Identity { run_id: reply.run_id, role, index: reply.index as u16, generation: reply.generation }
+}

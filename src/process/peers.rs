@@ -1,0 +1,61 @@
+//! Whether the other processes of a run are still alive.
+
+use ipc_schemas::Role;
+
+/// Another process of the run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Peer {
+    /// Its role.
+    pub role: Role,
+    /// Its index among the processes of the role.
+    pub index: u32,
+    /// Its process id.
+    pub process_id: u32,
+}
+
+impl std::fmt::Display for Peer {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.role {
+            Role::World => f.write_str("the world"),
+            role => write!(f, "{role} {}", self.index),
+        }
+    }
+}
+
+/// The processes somebody depends on.
+#[derive(Clone, Debug, Default)]
+pub struct Peers(pub Vec<Peer>);
+
+impl Peers {
+    /// The first peer that is no longer alive.
+    pub fn first_gone(&self) -> Option<Peer> {
+        self.0.iter().copied().find(|peer| !is_alive(peer.process_id))
+    }
+}
+
+/// Whether a process exists and is not merely waiting to be reaped.
+pub(super) fn is_alive(process_id: u32) -> bool {
+    match std::fs::read_to_string(format!("/proc/{process_id}/stat")) {
+        // The state follows the command name, which is in parentheses and may hold any character.
+        Ok(stat) => stat.rsplit(')').next().is_some_and(|rest| !rest.trim_start().starts_with(['Z', 'X'])),
+        Err(_) => rustix::process::Pid::from_raw(process_id as i32)
+            .is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_killed_child_is_gone_even_before_it_is_reaped() {
+        let mut child = std::process::Command::new("sleep").arg("60").spawn().expect("sleep exists");
+        assert!(is_alive(child.id()));
+        child.kill().expect("the child is ours");
+        while is_alive(child.id()) {
+            std::thread::yield_now();
+        }
+        child.wait().expect("the child can be reaped");
+        assert!(!is_alive(child.id()));
+    }
+}

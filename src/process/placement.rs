@@ -1,0 +1,56 @@
+//! On which cores the processes of a run are.
+
+use ipc_schemas::Role;
+use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+
+/// Where processes go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum Placement {
+    /// Wherever the system puts them.
+    #[default]
+    None,
+    /// The world on the first core; controllers on the others in turn; coordinators with the controllers,
+    /// where a hand-over costs no wake-up of an idle core.
+    Auto,
+}
+
+/// Runs `spawn` with the affinity the calling thread had before it was placed, which a child inherits.
+pub fn unplaced<T>(original: Option<&Affinity>, spawn: impl FnOnce() -> T) -> T {
+    let Some(Affinity(original)) = original else { return spawn() };
+    let placed = sched_getaffinity(None);
+    let _ = sched_setaffinity(None, original);
+    let result = spawn();
+    if let Ok(placed) = placed {
+        let _ = sched_setaffinity(None, &placed);
+    }
+    result
+}
+
+/// The cores a thread may use.
+#[derive(Debug)]
+pub struct Affinity(CpuSet);
+
+impl Affinity {
+    /// Of the calling thread.
+    pub fn current() -> Option<Affinity> {
+        sched_getaffinity(None).ok().map(Affinity)
+    }
+}
+
+/// Pins the calling thread, and what it starts from then on, by its role; returns its core, or `None` when it was left where it is.
+pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
+    if placement == Placement::None {
+        return None;
+    }
+    let allowed = sched_getaffinity(None).ok()?;
+    let cores: Vec<usize> = (0..CpuSet::MAX_CPU).filter(|&core| allowed.is_set(core)).collect();
+    let core = match (role, &cores[..]) {
+        (_, []) => return None,
+        (Role::World, [first, ..]) | (_, [first]) => *first,
+        (_, [_, others @ ..]) => others[index as usize % others.len()],
+    };
+    let mut set = CpuSet::new();
+    set.set(core);
+    sched_setaffinity(None, &set).ok()?;
+    Some(core)
+}

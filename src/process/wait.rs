@@ -1,0 +1,187 @@
+//! How a process waits for a frame: busily at first, then asleep, never for ever.
+
+use super::{Peers, ProcessError, StopFlag};
+use crate::lockstep::{Awaited, LockstepError, Progress};
+use crate::transport::iox::Bell;
+use ipc_schemas::{Role, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
+use std::time::{Duration, Instant};
+
+/// How the processes of a run wait for each other's frames.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum WaitMode {
+    /// World and controllers spin, then yield; coordinators sleep from event to event.
+    #[default]
+    Hybrid,
+    /// Everyone spins; needs a core for each process.
+    Spin,
+    /// Everyone sleeps until rung.
+    Block,
+}
+
+impl WaitMode {
+    /// The code in attach replies.
+    pub fn code(self) -> u32 {
+        match self {
+            WaitMode::Hybrid => WAITING_HYBRID,
+            WaitMode::Spin => WAITING_SPIN,
+            WaitMode::Block => WAITING_BLOCK,
+        }
+    }
+
+    /// The mode a reply names; an unknown code is the default, which always works.
+    pub fn from_code(code: u32) -> WaitMode {
+        match code {
+            WAITING_SPIN => WaitMode::Spin,
+            WAITING_BLOCK => WaitMode::Block,
+            _ => WaitMode::Hybrid,
+        }
+    }
+
+    /// Whether receivers of this role sleep on a bell, so that senders must ring.
+    pub fn has_bell(self, receiver: Role) -> bool {
+        match self {
+            WaitMode::Hybrid => receiver == Role::Coordinator,
+            WaitMode::Spin => false,
+            WaitMode::Block => true,
+        }
+    }
+}
+
+/// How long a process spins, yields and sleeps for one frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Patience {
+    /// Time spent spinning.
+    spin: Duration,
+    /// Time after which yielding ends too and sleeping begins.
+    busy: Duration,
+    /// Longest sleep between two polls.
+    nap: Duration,
+    /// A frame that takes longer ends the run.
+    timeout: Duration,
+}
+
+/// Frames are sure to come within this time while all is well; beyond it, spinning is a waste.
+const SPIN: Duration = Duration::from_micros(200);
+/// Yielding gives way to sleeping after this time.
+const BUSY: Duration = Duration::from_millis(2);
+/// Sleep between polls without a bell.
+const NAP: Duration = Duration::from_micros(50);
+/// Sleep on a bell: the ring ends it; this only bounds how late signals and dead peers are noticed.
+const BELL_NAP: Duration = Duration::from_millis(20);
+
+impl Patience {
+    /// What suits a role under a mode in a run with that many hot processes (world and controllers).
+    pub fn of(mode: WaitMode, role: Role, hot_processes: usize, timeout: Duration) -> Patience {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let sleeper = Patience { spin: Duration::ZERO, busy: Duration::ZERO, nap: BELL_NAP, timeout };
+        match mode {
+            WaitMode::Block => sleeper,
+            WaitMode::Hybrid if role == Role::Coordinator => sleeper,
+            // More spinners than cores would only keep each other from working.
+            WaitMode::Hybrid if hot_processes > cores => {
+                Patience { spin: Duration::ZERO, busy: BUSY, nap: NAP, timeout }
+            }
+            WaitMode::Hybrid => Patience { spin: SPIN, busy: BUSY, nap: NAP, timeout },
+            WaitMode::Spin => Patience { spin: Duration::MAX, busy: Duration::MAX, nap: NAP, timeout },
+        }
+    }
+}
+
+/// Waits for one frame after another.
+#[derive(Debug)]
+pub struct Waiter {
+    patience: Patience,
+    bell: Option<Bell>,
+    stop: StopFlag,
+    peers: Peers,
+    polls: u32,
+    since: Option<Instant>,
+    waited: Duration,
+    peers_checked: Duration,
+}
+
+/// How often the clock is read while polling busily: reading it costs about as much as a poll.
+const POLLS_PER_LOOK: u32 = 64;
+/// How often the peers are checked during a long wait.
+const PEER_CHECK: Duration = Duration::from_millis(50);
+
+impl Waiter {
+    /// A waiter that gives up when asked to stop, when a peer has died, or when patience runs out.
+    pub fn new(patience: Patience, bell: Option<Bell>, stop: StopFlag, peers: Peers) -> Waiter {
+        // Without a bell nobody ends a long sleep.
+        let nap = if bell.is_some() { patience.nap } else { patience.nap.min(NAP) };
+        Waiter {
+            patience: Patience { nap, ..patience },
+            bell,
+            stop,
+            peers,
+            polls: 0,
+            since: None,
+            waited: Duration::ZERO,
+            peers_checked: Duration::ZERO,
+        }
+    }
+
+    /// Something came.
+    pub fn reset(&mut self) {
+        self.polls = 0;
+        self.since = None;
+        self.waited = Duration::ZERO;
+        self.peers_checked = Duration::ZERO;
+    }
+
+    /// Nothing came: waits a little, or says why waiting is over.
+    pub fn wait(&mut self, awaited: Awaited) -> Result<(), ProcessError> {
+        self.polls = self.polls.wrapping_add(1);
+        let busy = self.waited < self.patience.busy;
+        if !busy || self.polls.is_multiple_of(POLLS_PER_LOOK) {
+            self.look(awaited)?;
+        }
+        if self.waited < self.patience.spin {
+            std::hint::spin_loop();
+        } else if busy {
+            std::thread::yield_now();
+        } else if let Some(bell) = &self.bell {
+            bell.sleep(self.patience.nap);
+        } else {
+            std::thread::sleep(self.patience.nap);
+        }
+        Ok(())
+    }
+
+    /// Looks at the signals, the clock and the peers.
+    fn look(&mut self, awaited: Awaited) -> Result<(), ProcessError> {
+        if self.stop.is_set() {
+            return Err(ProcessError::Interrupted { step: Some(awaited.step) });
+        }
+        self.waited = self.since.get_or_insert_with(Instant::now).elapsed();
+        if self.waited >= self.patience.timeout {
+            return Err(ProcessError::Timeout { awaited, seconds: self.patience.timeout.as_secs_f64() });
+        }
+        if self.waited >= self.peers_checked + PEER_CHECK {
+            self.peers_checked = self.waited;
+            if let Some(peer) = self.peers.first_gone() {
+                return Err(ProcessError::PeerGone {
+                    who: peer.to_string(),
+                    process_id: peer.process_id,
+                    awaited,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// Drives a state machine to the end of the run.
+    pub fn drive(
+        &mut self,
+        mut advance: impl FnMut() -> Result<Progress, LockstepError>,
+    ) -> Result<(), ProcessError> {
+        loop {
+            match advance()? {
+                Progress::Finished => return Ok(()),
+                Progress::Advanced => self.reset(),
+                Progress::Waiting(awaited) => self.wait(awaited)?,
+            }
+        }
+    }
+}
