@@ -97,6 +97,11 @@ impl InProcess {
         self.world.world()
     }
 
+    /// Makes the world keep completed visits (see [`World::record_visits`]).
+    pub fn record_visits(&mut self) {
+        self.world.record_visits();
+    }
+
     /// Whether a coordinator acted in the last step.
     pub fn was_event(&self) -> bool {
         self.world.was_event()

@@ -65,6 +65,11 @@ where
         &self.world
     }
 
+    /// Makes the world keep completed visits (see [`World::record_visits`]).
+    pub fn record_visits(&mut self) {
+        self.world.record_visits();
+    }
+
     /// Whether a coordinator acted in the step published last.
     pub fn was_event(&self) -> bool {
         self.was_event

@@ -3,7 +3,7 @@
 use super::car::{Car, LeftCar, Visit};
 use super::gate::may_enter;
 use super::link::{self, Link};
-use super::metrics::ZoneMetrics;
+use super::metrics::{CompletedVisit, ZoneMetrics};
 use super::role::{Traffic, World};
 use crate::scenario::{Exit, Scenario, Zone};
 use crate::vehicle::{Held, Merge, Pair, RearEnd, satisfiable_at};
@@ -102,6 +102,17 @@ impl World {
             });
             let instant_s = now_s + after_s;
             metrics.leave(&visit, instant_s - car.entry_time_s, merge_margin_m);
+            if let Some(visits) = &mut self.visits {
+                visits.push(CompletedVisit {
+                    vehicle: car.vehicle,
+                    zone: index as u32,
+                    entry_time_s: car.entry_time_s,
+                    exit_time_s: instant_s,
+                    exit_speed_mps: car.held.speed_mps(after_s),
+                    energy: visit.energy,
+                    fe_s: visit.fe_s,
+                });
+            }
             if first {
                 last = Some((after_s, car));
             }

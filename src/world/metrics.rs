@@ -91,6 +91,32 @@ impl ZoneMetrics {
     }
 }
 
+/// One vehicle's passage through one zone, from origin to conflict point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CompletedVisit {
+    /// The vehicle.
+    pub vehicle: u32,
+    /// Index of the zone in [`crate::scenario::Network::zones`].
+    pub zone: u32,
+    /// Instant of entry, s.
+    pub entry_time_s: f64,
+    /// Instant at which it passed the conflict point, s.
+    pub exit_time_s: f64,
+    /// Speed at the conflict point, m/s.
+    pub exit_speed_mps: f64,
+    /// Energy, the integral of u^2/2, m^2/s^3.
+    pub energy: f64,
+    /// Time in FE mode, s.
+    pub fe_s: f64,
+}
+
+impl CompletedVisit {
+    /// Travel time, s.
+    pub fn time_s(&self) -> f64 {
+        self.exit_time_s - self.entry_time_s
+    }
+}
+
 /// One zone's results.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ZoneSummaryRow {

@@ -7,5 +7,5 @@ mod link;
 mod metrics;
 mod role;
 
-pub use metrics::{WorldSummary, ZoneSummaryRow};
+pub use metrics::{CompletedVisit, WorldSummary, ZoneSummaryRow};
 pub use role::{CommandFault, CoordinatorMasks, World};

@@ -3,7 +3,7 @@
 use super::car::{Car, LeftCar};
 use super::gate::Gates;
 use super::link::Link;
-use super::metrics::{WorldSummary, ZoneMetrics};
+use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Exit, Scenario};
 use crate::vehicle::Held;
@@ -26,6 +26,8 @@ pub struct World {
     pub(super) departed: u32,
     pub(super) metrics: Vec<ZoneMetrics>,
     pub(super) entries: Vec<super::integrate::Entry>,
+    /// Completed visits in the order in which they ended, when they are recorded.
+    pub(super) visits: Option<Vec<CompletedVisit>>,
     state_hash: u64,
     /// Zones of each coordinator process, their neighbour processes, and who had an event.
     coordinators: Vec<CoordinatorShare>,
@@ -136,6 +138,7 @@ impl World {
             departed: 0,
             metrics: vec![ZoneMetrics::default(); zones],
             entries: Vec::new(),
+            visits: None,
             state_hash: 0,
             coordinators: shares,
             marks: vec![ZoneMarks::default(); zones],
@@ -161,6 +164,16 @@ impl World {
             || (self.gates.exhausted()
                 && self.zones.iter().all(|z| z.cars.is_empty())
                 && self.links.iter().all(|l| l.cars.is_empty()))
+    }
+
+    /// Keeps every visit completed from now on; nobody's motion or hash depends on it.
+    pub fn record_visits(&mut self) {
+        self.visits.get_or_insert_default();
+    }
+
+    /// The visits completed since [`record_visits`](Self::record_visits), zone by zone within a step.
+    pub fn visits(&self) -> &[CompletedVisit] {
+        self.visits.as_deref().unwrap_or_default()
     }
 
     /// Vehicles that have entered the network so far.

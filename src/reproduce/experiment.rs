@@ -1,0 +1,166 @@
+//! The paper's experiments as runs: traffic, demand, policy, setting.
+
+use super::paper::SECOND_TERMINAL_MPS;
+use super::runs::{Run, VARYING_SCENARIO};
+use crate::scenario::ReferenceLaw;
+use serde::Serialize;
+
+/// Constant or varying rates.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Traffic {
+    /// 400 veh/h and road, 120 vehicles, beta = 2/3.
+    Constant,
+    /// 300, 200, 400, 100, 400 veh/h and road for 400 s each, alpha = 0.25.
+    Varying,
+}
+
+/// Where arrivals come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Demand {
+    /// The traces made with SUMO's human drivers; there are three.
+    Traces,
+    /// The seeded random process, as many seeds as wished.
+    Seeded,
+}
+
+/// Seeds of the traces.
+pub const TRACE_SEEDS: u64 = 3;
+
+impl Demand {
+    /// Both.
+    pub const ALL: [Demand; 2] = [Demand::Traces, Demand::Seeded];
+
+    /// Name in tables.
+    pub fn name(self) -> &'static str {
+        match self {
+            Demand::Traces => "SUMO traces",
+            Demand::Seeded => "seeded process",
+        }
+    }
+
+    /// Seeds of this demand's replicates.
+    pub fn seeds(self, seeded: u64) -> std::ops::RangeInclusive<u64> {
+        1..=match self {
+            Demand::Traces => TRACE_SEEDS,
+            Demand::Seeded => seeded,
+        }
+    }
+}
+
+/// A column of every table of ours: which demand under which reading of the necessary condition.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub struct Variant {
+    /// Demand.
+    pub demand: Demand,
+    /// Transversality condition.
+    pub reference: ReferenceLaw,
+}
+
+impl Variant {
+    /// All, in the order of the tables' columns.
+    pub const ALL: [Variant; 4] = [
+        Variant { demand: Demand::Seeded, reference: ReferenceLaw::Corrected },
+        Variant { demand: Demand::Traces, reference: ReferenceLaw::Corrected },
+        Variant { demand: Demand::Seeded, reference: ReferenceLaw::AsPrinted },
+        Variant { demand: Demand::Traces, reference: ReferenceLaw::AsPrinted },
+    ];
+
+    /// Name in tables.
+    pub fn name(self) -> String {
+        let law = match self.reference {
+            ReferenceLaw::Corrected => "corrected",
+            ReferenceLaw::AsPrinted => "as printed",
+        };
+        format!("{law}, {}", self.demand.name())
+    }
+
+    /// Its `--set`s.
+    pub fn sets(self) -> Vec<String> {
+        match self.reference {
+            ReferenceLaw::Corrected => Vec::new(),
+            ReferenceLaw::AsPrinted => vec!["control.reference=as_printed".to_owned()],
+        }
+    }
+}
+
+/// Flow control of the first zone. The second zone's terminal speed is 18.5 m/s under flow control and
+/// free without, as the paper has it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Policy {
+    /// No flow control in either zone: the baseline.
+    None,
+    /// v_m1 is constant, m/s.
+    Fixed(f64),
+    /// v_m1 = 18 - N(L/4) / 2 under constant traffic, v_m1 = mean speed + 2 - N(L/4) / 2 under varying.
+    Feedback,
+}
+
+/// The fixed speed the paper compares with, m/s.
+pub const FIXED: Policy = Policy::Fixed(15.0);
+
+/// Roads of both scenarios.
+pub const ROADS: [&str; 3] = ["main1", "merge1", "merge2"];
+
+/// One replicate: everything but the policy.
+#[derive(Clone, Copy, Debug)]
+pub struct Replicate<'a> {
+    /// Where arrivals come from.
+    pub demand: Demand,
+    /// Seed of the arrivals, the same for every policy.
+    pub seed: u64,
+    /// Further `--set`s.
+    pub sets: &'a [String],
+}
+
+impl Replicate<'_> {
+    /// The run of a policy on these arrivals.
+    pub fn run(&self, traffic: Traffic, policy: Policy) -> Run {
+        let (scenario, rates) = match traffic {
+            Traffic::Constant => ("two-merges", "[{ until_s = 7200.0, vehicles_per_hour = 400.0 }]"),
+            Traffic::Varying => (VARYING_SCENARIO, ""),
+        };
+        let mut sets = Vec::new();
+        for road in ROADS {
+            match (traffic, self.demand) {
+                // What the scenario has by itself.
+                (Traffic::Constant, Demand::Traces) | (Traffic::Varying, Demand::Seeded) => {}
+                (Traffic::Constant, Demand::Seeded) => sets.push(format!(
+                    "roads.{road}.demand={{ rates = {rates}, min_headway_s = 1.2, speed_mean_mps = 16.0, \
+                     speed_sd_mps = 1.2, speed_min_mps = 10.0, speed_max_mps = 22.0 }}"
+                )),
+                (Traffic::Varying, Demand::Traces) => sets.push(format!(
+                    "roads.{road}.demand={{ trace = \"data/arrivals_varying_seed{{seed}}.csv\" }}"
+                )),
+            }
+        }
+        let first = match (policy, traffic) {
+            (Policy::None, _) => "{ policy = \"none\" }".to_owned(),
+            (Policy::Fixed(speed), _) => fixed(speed),
+            (Policy::Feedback, Traffic::Constant) => {
+                "{ policy = \"feedback\", baseline_mps = 18.0, gain_mps = 0.5, segment_m = 50.0 }".to_owned()
+            }
+            (Policy::Feedback, Traffic::Varying) => {
+                "{ policy = \"mean_speed\", offset_mps = 2.0, gain_mps = 0.5, segment_m = 50.0 }".to_owned()
+            }
+        };
+        let second = match policy {
+            Policy::None => first.clone(),
+            _ => fixed(SECOND_TERMINAL_MPS),
+        };
+        sets.push(format!("zones.merge-1.flow={first}"));
+        sets.push(format!("zones.merge-2.flow={second}"));
+        sets.extend_from_slice(self.sets);
+        Run { scenario, seed: self.seed, sets }
+    }
+}
+
+fn fixed(speed_mps: f64) -> String {
+    format!("{{ policy = \"fixed\", terminal_mps = {speed_mps:?} }}")
+}
+
+/// The fixed speeds of `fig:diff_v`, m/s.
+pub fn sweep_speeds() -> Vec<f64> {
+    (0..=16).map(|i| 12.0 + 0.5 * f64::from(i)).collect()
+}
