@@ -1,6 +1,7 @@
 //! Command-line arguments.
 
 use crate::process::{Placement, WaitMode};
+use crate::reproduce::cli::ReproduceArgs;
 use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
 use crate::scenario::{Override, Scenario, ScenarioError, load};
 use crate::transport::iox::RunName;
@@ -31,6 +32,8 @@ pub(super) enum Command {
     Ctrl(PartArgs),
     /// Compute one reference trajectory: duration, coefficients, cost.
     Plan(PlanArgs),
+    /// Regenerate the paper's tables and figures with intervals, verdicts and errata.
+    Reproduce(ReproduceArgs),
     /// Measure latency, the solver, or scale on this machine.
     Bench(BenchArgs),
 }

@@ -9,6 +9,7 @@ mod run;
 mod supervise;
 
 use crate::process::ProcessError;
+use crate::reproduce::{self, ReproduceError};
 use crate::scenario::ScenarioError;
 use clap::Parser;
 use std::process::ExitCode;
@@ -53,6 +54,17 @@ impl From<ProcessError> for AppError {
     }
 }
 
+impl From<ReproduceError> for AppError {
+    fn from(error: ReproduceError) -> AppError {
+        match error {
+            ReproduceError::UnknownPart { .. } | ReproduceError::TooFewSeeds(_) => {
+                AppError::Usage(error.to_string())
+            }
+            other => AppError::Failed(other.to_string()),
+        }
+    }
+}
+
 /// `cz`.
 pub fn cz() -> ExitCode {
     let args = args::Cz::parse();
@@ -64,6 +76,7 @@ pub fn cz() -> ExitCode {
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
             args::Command::Plan(args) => plan::plan(&args),
+            args::Command::Reproduce(args) => reproduce::cli::main(&args).map_err(AppError::from),
             args::Command::Bench(args) => bench::bench(&args),
         },
     )
