@@ -30,7 +30,7 @@ const ENDLESS: [&str; 11] = [
 
 /// A process that waits for others uses next to no processor time; one that steps uses all it gets.
 fn wait_until_stepping(world: u32) {
-    wait_until("the world to be stepping", || ticks(world) >= 30);
+    wait_until("the world to be stepping", || ticks(world) >= 10);
 }
 
 /// A `cz run` in the middle of things.
