@@ -35,6 +35,8 @@ where
     neighbour_mask: u64,
     last_step: Option<u64>,
     pending: Option<(S::Frame, u64)>,
+    /// Summaries of the pending step from neighbours who were quicker, for the next one: process, records.
+    early: Vec<(u16, Vec<ZoneSummary>)>,
     finished: bool,
 }
 
@@ -61,6 +63,7 @@ where
             neighbour_mask,
             last_step: None,
             pending: None,
+            early: Vec::new(),
             finished: false,
         }
     }
@@ -94,14 +97,21 @@ where
             return Ok(Progress::Finished);
         }
         if header.coordinators_acting >> self.identity.index & 1 == 1 {
-            let missing = header.coordinators_summarised & self.neighbour_mask;
+            let mut missing = header.coordinators_summarised & self.neighbour_mask;
+            for (index, summaries) in self.early.drain(..) {
+                // A neighbour's event makes this process act in the next step, so this is that step.
+                self.coordinator.receive(&summaries);
+                missing &= !(1 << index);
+            }
             self.pending = Some((state, missing));
         }
         Ok(Progress::Advanced)
     }
 
     fn take_summaries(&mut self, state: S::Frame, mut missing: u64) -> Result<Progress, LockstepError> {
-        // Summaries are of the step before: that is what makes the result independent of timing.
+        // Summaries are of the step before: that is what makes the result independent of timing. All of them
+        // were sent before the state was, but a quicker neighbour's next one may come in between: there is
+        // no order between senders.
         let step = state.header().step - 1;
         let Some(frame) = self.ports.summaries.receive()? else {
             self.pending = Some((state, missing));
@@ -110,17 +120,29 @@ where
         };
         let header = frame.header();
         let index = header.sender_index;
+        let is_early = header.step == step + 1;
         ExpectedHeader {
             run_id: self.identity.run_id,
             role: Role::Coordinator,
             index,
             generation: header.generation,
-            step,
+            step: if is_early { step + 1 } else { step },
         }
         .check(header, frame.records().len())
         .map_err(|fault| LockstepError::Header { sender: sender(header), fault })?;
-        if index >= 64 || missing >> index & 1 == 0 {
-            return Err(LockstepError::Unexpected { sender: sender(header), step });
+        let is_neighbour = index < 64 && self.neighbour_mask >> index & 1 == 1;
+        let is_asked_for = if is_early {
+            is_neighbour && self.early.iter().all(|(from, _)| *from != index)
+        } else {
+            is_neighbour && missing >> index & 1 == 1
+        };
+        if !is_asked_for {
+            return Err(LockstepError::Unexpected { sender: sender(header), step: header.step });
+        }
+        if is_early {
+            self.early.push((index, frame.records().to_vec()));
+            self.pending = Some((state, missing));
+            return Ok(Progress::Advanced);
         }
         self.coordinator.receive(frame.records());
         missing &= !(1 << index);
@@ -156,5 +178,73 @@ where
             return Err(LockstepError::LostReceiver { what, step, reached, expected });
         }
         Ok(Progress::Advanced)
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::scenario::load_embedded;
+    use crate::transport::memory::MemoryService;
+    use ipc_schemas::FrameHeader;
+    use std::sync::Arc;
+
+    /// A coordinator of the tree with neighbours 2 and 4, in a run of one process per zone.
+    const OWN: u16 = 3;
+
+    fn header(role: Role, index: u16, step: u64) -> FrameHeader {
+        Identity { run_id: 7, role, index, generation: 0 }.header(step, 0)
+    }
+
+    fn send<R: ipc_schemas::Record>(outbox: &mut impl Outbox<R>, header: FrameHeader, records: &[R]) {
+        let fill = |slots: &mut crate::transport::Slots<'_, R>| records.iter().for_each(|r| slots.push(*r));
+        outbox.loan(header, records.len(), fill).unwrap().send().unwrap();
+    }
+
+    #[test]
+    fn a_quick_neighbours_next_summary_waits_for_its_step() {
+        let scenario = Arc::new(load_embedded("tree", &[], None).unwrap());
+        let mut states = MemoryService::<VehicleState>::new("state");
+        let mut summaries = MemoryService::<ZoneSummary>::new("summary");
+        let mut coordination = MemoryService::<Assignment>::new("coordination");
+        let mut out = coordination.inbox();
+        let ports = CoordinatorPorts {
+            state: states.inbox(),
+            summaries: summaries.inbox(),
+            neighbours: [2, 4]
+                .map(|i| (i, u32::from(i)..u32::from(i) + 1, MemoryService::new("n").outbox()))
+                .into(),
+            coordination: coordination.outbox(),
+        };
+        let role = Coordinator::new(scenario, u32::from(OWN)..u32::from(OWN) + 1);
+        let identity = Identity { run_id: 7, role: Role::Coordinator, index: OWN, generation: 0 };
+        let mut driver = CoordinatorDriver::new(role, ports, identity, 1);
+        let (mut world, mut second, mut fourth) = (states.outbox(), summaries.outbox(), summaries.outbox());
+        let state = |step, summarised| FrameHeader {
+            coordinators_acting: 1 << OWN,
+            coordinators_summarised: summarised,
+            ..header(Role::World, 0, step)
+        };
+        let mut act = |driver: &mut CoordinatorDriver<_, _, _, _>, step| {
+            while driver.advance().unwrap() == Progress::Advanced {}
+            out.receive().unwrap().map(|f| f.header().step) == Some(step)
+        };
+
+        send(&mut second, header(Role::Coordinator, 2, 0), &[]);
+        send(&mut world, state(1, 1 << 2 | 1 << 4), &[]);
+        // The second one has taken state 1 too, acted, and sent the next summary.
+        send(&mut second, header(Role::Coordinator, 2, 1), &[]);
+        assert!(!act(&mut driver, 1), "the fourth one's summary is missing");
+        send(&mut fourth, header(Role::Coordinator, 4, 0), &[]);
+        assert!(act(&mut driver, 1));
+        send(&mut world, state(2, 1 << 2), &[]);
+        assert!(act(&mut driver, 2), "the early summary counts now");
+        send(&mut world, state(3, 1 << 4), &[]);
+        assert!(!act(&mut driver, 3));
+        // Two steps early is nobody's right.
+        send(&mut fourth, header(Role::Coordinator, 4, 4), &[]);
+        let error = driver.advance().unwrap_err();
+        assert!(matches!(error, LockstepError::Header { .. }), "{error}");
     }
 }
