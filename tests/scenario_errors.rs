@@ -348,7 +348,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "gain_mps = 0.5",
         "gain_mps = -0.5",
-        "s.toml:26: zones.first.flow.gain_mps = -0.5: expected a gain > 0 m/s per vehicle",
+        "s.toml:26: zones.first.flow.gain_mps = -0.5: expected a gain >= 0 m/s per vehicle",
     ),
     (
         "segment_m = 50",
