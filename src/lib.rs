@@ -7,6 +7,7 @@ pub mod coordination;
 pub mod lockstep;
 pub mod process;
 pub mod scenario;
+pub mod shield;
 pub mod transport;
 pub mod vehicle;
 pub mod world;

@@ -105,6 +105,13 @@ impl ShareArgs {
                 )));
             }
         }
+        let (controllers, plugins) = (scenario.controllers(self.ctrl_procs), scenario.plugins.len());
+        if controllers > MAX_CONTROLLERS {
+            return Err(super::AppError::Usage(format!(
+                "--ctrl-procs {}: with the scenario's {plugins} controllers, expected at most {MAX_CONTROLLERS}",
+                self.ctrl_procs
+            )));
+        }
         Ok(())
     }
 }
@@ -136,6 +143,14 @@ pub(super) struct RunArgs {
     pub in_process: bool,
     #[command(flatten)]
     pub share: ShareArgs,
+    /// Let a program of your own drive zones or approaches, e.g. `--controller merge-2="python3 mine.py"`;
+    /// may be repeated. TARGET is a list such as `merge-1,merge-2.main`, or the name of a controller that
+    /// the scenario declares.
+    #[arg(long = "controller", value_name = "TARGET=COMMAND")]
+    pub controllers: Vec<String>,
+    /// What becomes of commands that are not safe, in place of the scenario's `shield`: off, observe, on.
+    #[arg(long, value_name = "MODE")]
+    pub shield: Option<String>,
     /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,

@@ -1,6 +1,7 @@
 //! The command line: what the four programs have in common, and what they print.
 
 mod args;
+mod controllers;
 mod parts;
 mod plan;
 mod report;

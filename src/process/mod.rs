@@ -3,6 +3,7 @@
 mod attach;
 mod participant;
 mod peers;
+mod run_spec;
 mod stop;
 mod wait;
 mod world;
@@ -10,6 +11,7 @@ mod world;
 pub use attach::{Attachment, Joining};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
+pub use run_spec::plugin_bytes;
 pub use stop::StopFlag;
 pub use wait::{Patience, Waiter};
 pub use world::{LatencyUs, Outcome, WorldOptions, run_in_process, run_world};

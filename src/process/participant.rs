@@ -61,13 +61,15 @@ pub fn run_controller(
     let attachment = Attachment::join(&space, run, joining, stop)?;
     let AttachReply { index, controllers, first_step, .. } = attachment.reply;
     let scenario = &attachment.scenario;
+    // Plug-ins come behind the processes of the pool.
+    let pool = controllers - scenario.plugins.len() as u32;
     let zones = scenario.network.zones.len() as u32;
     let ports = ControllerPorts {
         state: space.open(frames::SERVICE_STATE)?.inbox()?,
         coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
         command: space.open(frames::SERVICE_COMMAND)?.outbox(expected_vehicles(scenario))?,
     };
-    let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, controllers));
+    let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
     let identity = identity(&attachment.reply, Role::Controller);
     let mut driver = ControllerDriver::new(role, ports, identity, first_step);
     attachment.ready(stop)?;

@@ -183,7 +183,7 @@ fn receive_all(
         if Instant::now() >= deadline {
             return Err(ProcessError::Missing {
                 run: options.run.to_string(),
-                missing: format!("{role} {index}"),
+                missing: reception.name_of(role, index),
                 command: if role == Role::Coordinator { "cz-coord" } else { "cz-ctrl" },
                 seconds: options.attach_timeout.as_secs_f64(),
             });

@@ -37,6 +37,16 @@ pub(super) struct Visit {
     pub clean_rear_end: bool,
     pub clean_merge: bool,
     pub least_rear_end_m: f64,
+    /// What the shield holds the vehicle to.
+    pub rear_end: Guard,
+    pub merge: Guard,
+}
+
+/// Whether a vehicle was safe toward a partner when it came to owe it something.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Guard {
+    pub partner: Option<u32>,
+    pub safe: bool,
 }
 
 impl Visit {
@@ -47,6 +57,8 @@ impl Visit {
         clean_rear_end: true,
         clean_merge: true,
         least_rear_end_m: f64::INFINITY,
+        rear_end: Guard { partner: None, safe: false },
+        merge: Guard { partner: None, safe: false },
     };
 }
 

@@ -2,10 +2,12 @@
 
 mod car;
 mod gate;
+mod gateway;
 mod integrate;
 mod link;
 mod metrics;
 mod role;
 
-pub use metrics::{WorldSummary, ZoneSummaryRow};
-pub use role::{CommandFault, CoordinatorMasks, World};
+pub use gateway::CommandFault;
+pub use metrics::{ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
+pub use role::{CoordinatorMasks, World};
