@@ -150,16 +150,22 @@ fn built_in(scenario: &Arc<Scenario>) -> control_zones::world::WorldSummary {
 
 #[test]
 fn changes_nothing_when_nothing_is_violated() {
-    let with = |shield: &str| {
-        let base = scenario("two-merges", shield, 6.0, 60.0, 3);
-        built_in(&Arc::new(Scenario { max_vehicles: Some(200), ..(*base).clone() }))
-    };
-    let (off, on) = (with("off"), with("on"));
-    let row = &on.shield.controllers[0];
-    assert_eq!((row.rear_end, row.merge, row.speed, row.limits, row.began_unsafe), (0, 0, 0, 0, 0));
-    assert!(row.commands > 10_000);
-    assert_eq!(on.state_hash, off.state_hash);
-    assert_eq!(with("observe").state_hash, off.state_hash);
+    let mut quiet = 0;
+    for seed in 1..=20 {
+        let with = |shield: &str| {
+            let base = scenario("two-merges", shield, 4.0, 120.0, seed);
+            built_in(&Arc::new(Scenario { max_vehicles: Some(60), ..(*base).clone() }))
+        };
+        let (off, observed) = (with("off"), with("observe"));
+        assert_eq!(observed.state_hash, off.state_hash, "observing changes nothing, ever");
+        let row = &observed.shield.controllers[0];
+        assert!(row.commands > 5_000);
+        if (row.rear_end, row.merge, row.speed, row.began_unsafe) == (0, 0, 0, 0) {
+            quiet += 1;
+            assert_eq!(with("on").state_hash, off.state_hash);
+        }
+    }
+    assert!(quiet >= 5, "only {quiet} runs without a violation");
 }
 
 #[test]
