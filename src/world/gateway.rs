@@ -99,6 +99,11 @@ pub enum CommandFault {
     },
 }
 
+/// A vehicle that leaves the network more slowly speeds up to this outside, m/s.
+const LEAST_EXIT_MPS: f64 = 5.0;
+/// How it does, m/s^2.
+const EXIT_MPS2: f64 = 2.0;
+
 /// The gateway's configuration and what it has counted.
 #[derive(Debug)]
 pub(super) struct Gateway {
@@ -257,7 +262,12 @@ impl World {
             self.drive_link(scenario, zone, dt_s);
             // Index 0 moves with the vehicle it stands for.
             if let Some(left) = &mut self.zones[zone].left {
-                let u = self.held_u_mps2[left.car.vehicle as usize];
+                let mut u = self.held_u_mps2[left.car.vehicle as usize];
+                // Out of the network nobody drives it. Whoever left it creeping must not creep for ever:
+                // those behind would have to leave more slowly each, down to a standstill.
+                if scenario.network.zones[zone].exit == Exit::Out && left.car.v_mps < LEAST_EXIT_MPS {
+                    u = EXIT_MPS2.min(scenario.vehicle.u_max_mps2);
+                }
                 left.car.held = Held::new(left.car.x_m, left.car.v_mps, u);
             }
             if self.gateway.mode != ShieldMode::Off {
