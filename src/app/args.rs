@@ -30,6 +30,21 @@ pub(super) enum Command {
     Ctrl(PartArgs),
     /// Compute one reference trajectory: duration, coefficients, cost.
     Plan(PlanArgs),
+    /// What controllers in C and C++ are built against.
+    Sdk {
+        #[command(subcommand)]
+        command: SdkCommand,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum SdkCommand {
+    /// Install headers, libraries, and files for pkg-config and CMake.
+    Install {
+        /// Directory to install under.
+        #[arg(long, value_name = "DIR")]
+        prefix: PathBuf,
+    },
 }
 
 /// A program of its own around the arguments of a subcommand.

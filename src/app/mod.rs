@@ -6,6 +6,7 @@ mod parts;
 mod plan;
 mod report;
 mod run;
+mod sdk;
 mod supervise;
 
 use crate::process::ProcessError;
@@ -62,6 +63,7 @@ pub fn cz() -> ExitCode {
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
             args::Command::Plan(args) => plan::plan(&args),
+            args::Command::Sdk { command } => sdk::sdk(&command),
         },
     )
 }

@@ -28,7 +28,7 @@ mod space;
 mod view;
 
 pub use ipc_schemas as schemas;
-pub use session::{Session, Wake};
+pub use session::{Commands, Session, Wake};
 pub use view::{Approach, Partner, Run, Step, Vehicle};
 
 use ipc_schemas::{HeaderFault, VehicleCommand};

@@ -204,6 +204,11 @@ impl Session {
         }
     }
 
+    /// The coordination in force in a zone.
+    pub fn assignments(&self, zone: u32) -> &[Assignment] {
+        self.assignments.get(zone as usize).map_or(&[], Vec::as_slice)
+    }
+
     /// Lends a command frame with header, vehicles and zones filled in and accelerations of 0.
     pub fn take_commands(&mut self) -> Result<Commands, Error> {
         let Some(state) = self.pending.as_ref().filter(|_| self.is_complete) else {
