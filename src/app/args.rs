@@ -30,11 +30,34 @@ pub(super) enum Command {
     Ctrl(PartArgs),
     /// Compute one reference trajectory: duration, coefficients, cost.
     Plan(PlanArgs),
+    /// Controllers of your own: check one against the contract, or numbers against the law.
+    Plugin {
+        #[command(subcommand)]
+        command: PluginCommand,
+    },
     /// What controllers in C and C++ are built against.
     Sdk {
         #[command(subcommand)]
         command: SdkCommand,
     },
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum PluginCommand {
+    /// Start a controller against a scripted world and report, rule by rule, whether it keeps the contract.
+    Check {
+        /// Time within which each step is to be answered, ms.
+        #[arg(long, value_name = "MS", default_value_t = 100.0)]
+        deadline_ms: f64,
+        /// Print JSON.
+        #[arg(long)]
+        json: bool,
+        /// The controller's command line, after `--`.
+        #[arg(last = true, required = true, value_name = "COMMAND")]
+        command: Vec<String>,
+    },
+    /// Print test vectors of the paper's law as JSON: trajectories, rows and commands.
+    Golden,
 }
 
 #[derive(Debug, Subcommand)]

@@ -2,8 +2,10 @@
 
 mod args;
 mod controllers;
+mod golden;
 mod parts;
 mod plan;
+mod plugin;
 mod report;
 mod run;
 mod sdk;
@@ -63,6 +65,7 @@ pub fn cz() -> ExitCode {
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
             args::Command::Plan(args) => plan::plan(&args),
+            args::Command::Plugin { command } => plugin::plugin(&command),
             args::Command::Sdk { command } => sdk::sdk(&command),
         },
     )

@@ -180,6 +180,11 @@ pub(super) struct Reception {
     /// Name hash, and the bytes behind the reply, of each plug-in.
     plugins: Vec<(u64, Vec<u8>)>,
     plugin_names: String,
+    /// What a plug-in that joins is told: 0 and 0, but for a restarted one.
+    pub(super) generation: u32,
+    pub(super) first_step: u64,
+    /// Why somebody was refused last.
+    pub(super) last_refusal: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -208,6 +213,9 @@ impl Reception {
             desk: space.create_attach_desk((coordinators + controllers) as usize, longest)?,
             pool: drivers.pool() as usize,
             plugins,
+            generation: 0,
+            first_step: 0,
+            last_refusal: None,
             plugin_names: scenario.plugins.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", "),
             run_id,
             scenario_hash: scenario_hash(scenario),
@@ -226,10 +234,10 @@ impl Reception {
                 run_id: self.run_id,
                 schema_hash: schema_hash(),
                 scenario_hash: self.scenario_hash,
-                first_step: 0,
+                first_step: self.first_step,
                 status,
                 world_process_id: std::process::id(),
-                generation: 0,
+                generation: self.generation,
                 index,
                 coordinators: self.coordinators.len() as u32,
                 controllers: self.controllers.len() as u32,
@@ -237,6 +245,7 @@ impl Reception {
             let reason;
             let behind = if status != frames::ATTACH_ACCEPTED {
                 reason = refusal(&request, &reply, &self.plugin_names);
+                self.last_refusal = Some(reason.clone());
                 reason.as_bytes()
             } else if request.controller == frames::BUILT_IN {
                 &self.scenario[..]
@@ -305,6 +314,16 @@ impl Reception {
             Some(name) => format!("controller {name} (attaching as CZ_CONTROLLER={name})"),
             None => format!("{role} {index}"),
         }
+    }
+
+    /// Whether a controller is ready.
+    pub(super) fn is_ready(&self, controller: usize) -> bool {
+        self.controllers[controller].is_some_and(|s| s.ready)
+    }
+
+    /// Frees the place of a controller that has been ended.
+    pub(super) fn vacate(&mut self, controller: usize) {
+        self.controllers[controller] = None;
     }
 
     /// All participants.

@@ -3,6 +3,7 @@
 mod attach;
 mod participant;
 mod peers;
+pub mod plugin_check;
 mod run_spec;
 mod stop;
 mod wait;

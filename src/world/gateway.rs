@@ -222,6 +222,11 @@ impl World {
         }
     }
 
+    /// Forgets the commands taken for this step, so that all can be given again.
+    pub fn forget_commands(&mut self) {
+        self.commanded = 0;
+    }
+
     /// What is wrong with a frame whose record is not the one expected there (vehicle and zone; `None` at
     /// the end of the frame).
     fn mismatch(

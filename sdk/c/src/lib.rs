@@ -110,6 +110,7 @@ pub unsafe extern "C" fn cz_attach(
             run: text(run, "CZ_RUN")?,
             controller: text(controller, "CZ_CONTROLLER")?,
             attach_timeout: duration(timeout_s),
+            schema_hash: control_zones_plugin::schemas::schema_hash(),
         };
         let session = Session::attach(&options)?;
         let approaches = session.run().approaches.iter().map(|a| a.spec).collect();

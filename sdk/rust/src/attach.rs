@@ -55,7 +55,7 @@ pub(crate) fn join(options: &Options) -> Result<(Node<ipc::Service>, Line, Attac
     }
     let request = AttachRequest {
         instance: u64::from_le_bytes(instance),
-        schema_hash: frames::schema_hash(),
+        schema_hash: options.schema_hash,
         scenario_hash: frames::ANY_SCENARIO,
         controller: frames::name_hash(&options.controller),
         process_id: std::process::id(),

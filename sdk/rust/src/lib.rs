@@ -92,6 +92,9 @@ pub struct Options {
     pub controller: String,
     /// How long to wait for the world.
     pub attach_timeout: Duration,
+    /// Schema hash to claim, for tests of those who check it.
+    #[doc(hidden)]
+    pub schema_hash: u64,
 }
 
 impl Options {
@@ -102,6 +105,7 @@ impl Options {
             run: variable("CZ_RUN")?,
             controller: variable("CZ_CONTROLLER")?,
             attach_timeout: Duration::from_secs(30),
+            schema_hash: ipc_schemas::schema_hash(),
         })
     }
 }

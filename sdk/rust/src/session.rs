@@ -211,6 +211,12 @@ impl Session {
 
     /// Lends a command frame with header, vehicles and zones filled in and accelerations of 0.
     pub fn take_commands(&mut self) -> Result<Commands, Error> {
+        self.lend(self.count())
+    }
+
+    /// The same with another number of records, for tests of those who check frames.
+    #[doc(hidden)]
+    pub fn lend(&mut self, count: usize) -> Result<Commands, Error> {
         let Some(state) = self.pending.as_ref().filter(|_| self.is_complete) else {
             return Err(Error::OutOfTurn("there is no step to answer; wait for one first"));
         };
@@ -218,10 +224,11 @@ impl Session {
         let members = &self.members;
         let mut sample = self
             .commands
-            .loan_slice_uninit(members.len())
+            .loan_slice_uninit(count)
             .map_err(|e| failed("lend a command frame; send the one lent before first", &e))?
             .write_from_fn(|i| {
-                let VehicleState { vehicle, zone, .. } = states[members[i] as usize];
+                let Some(&at) = members.get(i) else { return VehicleCommand::default() };
+                let VehicleState { vehicle, zone, .. } = states[at as usize];
                 VehicleCommand { vehicle, zone, mode: frames::MODE_OCBF, ..VehicleCommand::default() }
             });
         *sample.user_header_mut() = FrameHeader {
@@ -232,7 +239,7 @@ impl Session {
             sender_role: frames::ROLE_CONTROLLER,
             sender_index: self.reply.index as u16,
             generation: self.reply.generation,
-            record_count: members.len() as u32,
+            record_count: count as u32,
             ..FrameHeader::default()
         };
         Ok(Commands(sample))
