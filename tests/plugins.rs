@@ -1,5 +1,7 @@
 //! Controllers written elsewhere, driven end to end.
 
+#![allow(clippy::unwrap_used)] // a test
+
 use assert_cmd::Command;
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::load;

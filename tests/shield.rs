@@ -1,5 +1,7 @@
 //! The shield against adversaries, in the world itself: a million vehicle-steps each.
 
+#![allow(clippy::unwrap_used)] // a test
+
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{Override, Scenario, load};
 use control_zones::world::{ShieldRow, World};

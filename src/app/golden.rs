@@ -1,8 +1,8 @@
 //! Test vectors of the paper's law, for authors who check their numbers.
 
+use crate::control::Terminal;
 use crate::control::law::{Law, Memory, Mode, Partner, PartnerKind, Situation};
 use crate::control::reference::Problem;
-use crate::control::Terminal;
 use crate::scenario::{ReferenceLaw, load};
 use serde_json::{Value, json};
 
@@ -19,7 +19,8 @@ pub(super) fn text() -> String {
 
 fn plans() -> Vec<Value> {
     let mut vectors = Vec::new();
-    for (v0, length_m, beta) in [(14.0, 200.0, 2.0 / 3.0), (20.0, 200.0, 8.0 / 3.0), (8.0, 350.0, 8.0 / 15.0)] {
+    for (v0, length_m, beta) in [(14.0, 200.0, 2.0 / 3.0), (20.0, 200.0, 8.0 / 3.0), (8.0, 350.0, 8.0 / 15.0)]
+    {
         for terminal in [Terminal::Free, Terminal::Speed(12.0), Terminal::Speed(18.5)] {
             let problem = Problem { beta, v0_mps: v0, length_m, terminal };
             let optimum = problem.solve_forward(ReferenceLaw::Corrected);

@@ -5,8 +5,8 @@
 //! brakes to a stop, a restart in mid-run, and the end of the run. A bad frame is noted under the rule it
 //! breaks and replaced, so that one fault does not hide the others.
 
-use super::attach::Reception;
 use super::ProcessError;
+use super::attach::Reception;
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::scenario::Scenario;
@@ -412,11 +412,15 @@ impl Kit<'_> {
         self.answered += 1;
         if took > self.deadline {
             let ms = |d: Duration| d.as_secs_f64() * 1e3;
-            self.breach(Rule::Deadline, format!("took {:.1} ms, allowed are {:.1}", ms(took), ms(self.deadline)));
+            self.breach(
+                Rule::Deadline,
+                format!("took {:.1} ms, allowed are {:.1}", ms(took), ms(self.deadline)),
+            );
         }
         let generation = self.reception.generation;
         let index = INDEX as u16;
-        let expected = ExpectedHeader { run_id: self.run_id, role: Role::Controller, index, generation, step };
+        let expected =
+            ExpectedHeader { run_id: self.run_id, role: Role::Controller, index, generation, step };
         let header = expected.check(frame.header(), frame.records().len());
         let mut records = frame.records().to_vec();
         drop(frame);
@@ -441,7 +445,9 @@ impl Kit<'_> {
         }
         if let Err(fault) = self.world.command(INDEX, &records) {
             let rule = match fault {
-                CommandFault::UnknownVehicle { .. } | CommandFault::ForeignVehicle { .. } => Rule::OwnVehicles,
+                CommandFault::UnknownVehicle { .. } | CommandFault::ForeignVehicle { .. } => {
+                    Rule::OwnVehicles
+                }
                 CommandFault::Duplicate { .. } => Rule::NoDuplicates,
                 CommandFault::MissingVehicle { .. } => Rule::AllVehicles,
                 CommandFault::OtherZone { .. } => Rule::Zone,

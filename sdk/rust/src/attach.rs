@@ -78,7 +78,8 @@ type Pair = (Publisher<ipc::Service, AttachRequest, ()>, Subscriber<ipc::Service
 
 /// Both ends of the reception; `None` while the world has not opened it.
 fn services(node: &Node<ipc::Service>) -> Result<Option<Pair>, Error> {
-    let missing = |e: &Open| matches!(e, Open::DoesNotExist | Open::IsMarkedForDestruction | Open::HangsInCreation);
+    let missing =
+        |e: &Open| matches!(e, Open::DoesNotExist | Open::IsMarkedForDestruction | Open::HangsInCreation);
     let requests = match node
         .service_builder(&name(frames::SERVICE_ATTACH)?)
         .publish_subscribe::<AttachRequest>()
@@ -155,8 +156,11 @@ fn read_run(all: &[u8], index: u32) -> Result<Run, Error> {
         specs.push(read::<ApproachSpec>(&mut bytes).ok_or_else(bad)?);
     }
     let text = std::str::from_utf8(bytes).map_err(|_| bad())?;
-    let approaches: Vec<Approach> =
-        specs.into_iter().zip(text.lines()).map(|(spec, name)| Approach { spec, name: name.to_owned() }).collect();
+    let approaches: Vec<Approach> = specs
+        .into_iter()
+        .zip(text.lines())
+        .map(|(spec, name)| Approach { spec, name: name.to_owned() })
+        .collect();
     if approaches.len() != spec.approaches as usize {
         return Err(bad());
     }
