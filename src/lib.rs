@@ -10,6 +10,7 @@ pub mod lockstep;
 pub mod process;
 pub mod reproduce;
 pub mod scenario;
+pub mod shield;
 pub mod transport;
 pub mod vehicle;
 pub mod world;

@@ -116,7 +116,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "dts = 0.1",
-        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, roads, zones; did you mean dt_s?",
+        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers; did you mean dt_s?",
     ),
     (
         "dt_s = 0.1",
@@ -487,11 +487,11 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "dt=0.1",
-        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, roads, zones; did you mean dt_s?",
+        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers; did you mean dt_s?",
     ),
     (
         "network.size=3",
-        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, roads, zones",
+        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers",
     ),
     (
         "control.replan=from_stat",

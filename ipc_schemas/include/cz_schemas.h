@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0x2a0cc8c48918c06b)
+#define CZ_SCHEMA_HASH UINT64_C(0xfb18d61d5f65d583)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -83,6 +83,8 @@
 /** `cz_vehicle_command_t.verdict`: no command satisfies all rows; `u_min` was sent. */
 #define CZ_VERDICT_INFEASIBLE UINT16_C(3)
 
+/** `cz_attach_request_t.controller`: a process of the built-in pool, or a coordinator. */
+#define CZ_BUILT_IN UINT64_C(0)
 /** `cz_attach_request_t.wanted_index`: any free index will do. */
 #define CZ_ANY_INDEX UINT16_C(65535)
 /** `cz_attach_request_t.scenario_hash`: no scenario of one's own, take the world's. */
@@ -108,6 +110,34 @@
 #define CZ_ATTACH_NO_ROOM UINT32_C(3)
 /** `cz_attach_reply_t.status`: the request names a role no participant has. */
 #define CZ_ATTACH_BAD_ROLE UINT32_C(4)
+/** `cz_attach_reply_t.status`: the scenario declares no controller of that name. */
+#define CZ_ATTACH_NO_CONTROLLER UINT32_C(5)
+
+/** `cz_approach_spec_t.flags`: the controller that asked drives this approach. */
+#define CZ_APPROACH_OWN UINT32_C(1)
+/** `cz_run_spec_t.law_flags`: the reference trajectory follows the condition as the paper prints
+ *  it. */
+#define CZ_LAW_AS_PRINTED UINT32_C(1)
+/** `cz_run_spec_t.law_flags`: a new terminal speed makes a new plan from the present state. */
+#define CZ_LAW_REPLAN_FROM_STATE UINT32_C(2)
+/** `cz_run_spec_t.law_flags`: the reference time is the exact root of `x*(t_ref) = x`. */
+#define CZ_LAW_EXACT_FEEDBACK UINT32_C(4)
+/** `cz_run_spec_t.law_flags`: the rear-end row is the one for a command held over the step. */
+#define CZ_LAW_SAMPLED_ROWS UINT32_C(8)
+/** `cz_run_spec_t.law_flags`: the feasibility rows are present. */
+#define CZ_LAW_FEASIBILITY_ROWS UINT32_C(16)
+/** `cz_run_spec_t.law_flags`: the CLF row is present. */
+#define CZ_LAW_CLF UINT32_C(32)
+/** `cz_run_spec_t.law_flags`: FE mode asks only for the barriers. */
+#define CZ_LAW_FE_BARRIER UINT32_C(64)
+/** `cz_run_spec_t.law_flags`: there is no FE mode. */
+#define CZ_LAW_FE_OFF UINT32_C(128)
+/** `cz_run_spec_t.shield`: unsafe commands are applied. */
+#define CZ_SHIELD_OFF UINT32_C(0)
+/** `cz_run_spec_t.shield`: unsafe commands are applied and counted. */
+#define CZ_SHIELD_OBSERVE UINT32_C(1)
+/** `cz_run_spec_t.shield`: unsafe commands are replaced by the nearest safe ones. */
+#define CZ_SHIELD_ON UINT32_C(2)
 
 /** World -> controllers: `cz_vehicle_state_t` of every step. */
 #define CZ_SERVICE_STATE "cz/state"
@@ -140,6 +170,8 @@
 #define CZ_TYPE_NAME_VEHICLE_COMMAND "cz.VehicleCommand.v1"
 #define CZ_TYPE_NAME_ATTACH_REQUEST "cz.AttachRequest.v1"
 #define CZ_TYPE_NAME_ATTACH_REPLY "cz.AttachReply.v1"
+#define CZ_TYPE_NAME_RUN_SPEC "cz.RunSpec.v1"
+#define CZ_TYPE_NAME_APPROACH_SPEC "cz.ApproachSpec.v1"
 
 /** Precedes the records of every frame, whatever its type.
  *
@@ -366,6 +398,9 @@ typedef struct cz_attach_request {
     uint64_t schema_hash;
     /** Hash of the scenario the participant was given, or 0 to take the world's. */
     uint64_t scenario_hash;
+    /** Which plug-in this is: FNV-1a, 64 bits, of the name the scenario gives it; 0 for a process
+     *  of the built-in pool. */
+    uint64_t controller;
     /** Process id, for liveness checks and messages. */
     uint32_t process_id;
     /** 2 coordinator, 3 controller. */
@@ -377,18 +412,21 @@ typedef struct cz_attach_request {
     /** Index assigned in the reply to the join; 0 while joining. */
     uint32_t index;
 } cz_attach_request_t;
-CZ_ASSERT_(attach_request_size, sizeof(cz_attach_request_t) == 40);
+CZ_ASSERT_(attach_request_size, sizeof(cz_attach_request_t) == 48);
 CZ_ASSERT_ALIGN_(cz_attach_request_t, 8);
 CZ_ASSERT_(attach_request_instance_offset, offsetof(cz_attach_request_t, instance) == 0);
 CZ_ASSERT_(attach_request_schema_hash_offset, offsetof(cz_attach_request_t, schema_hash) == 8);
 CZ_ASSERT_(attach_request_scenario_hash_offset, offsetof(cz_attach_request_t, scenario_hash) == 16);
-CZ_ASSERT_(attach_request_process_id_offset, offsetof(cz_attach_request_t, process_id) == 24);
-CZ_ASSERT_(attach_request_role_offset, offsetof(cz_attach_request_t, role) == 28);
-CZ_ASSERT_(attach_request_wanted_index_offset, offsetof(cz_attach_request_t, wanted_index) == 30);
-CZ_ASSERT_(attach_request_phase_offset, offsetof(cz_attach_request_t, phase) == 32);
-CZ_ASSERT_(attach_request_index_offset, offsetof(cz_attach_request_t, index) == 36);
+CZ_ASSERT_(attach_request_controller_offset, offsetof(cz_attach_request_t, controller) == 24);
+CZ_ASSERT_(attach_request_process_id_offset, offsetof(cz_attach_request_t, process_id) == 32);
+CZ_ASSERT_(attach_request_role_offset, offsetof(cz_attach_request_t, role) == 36);
+CZ_ASSERT_(attach_request_wanted_index_offset, offsetof(cz_attach_request_t, wanted_index) == 38);
+CZ_ASSERT_(attach_request_phase_offset, offsetof(cz_attach_request_t, phase) == 40);
+CZ_ASSERT_(attach_request_index_offset, offsetof(cz_attach_request_t, index) == 44);
 
-/** World -> participant: the answer. The payload of the frame is the encoded scenario. */
+/** World -> participant: the answer. Behind it: for a coordinator or a process of the built-in pool
+ *  the encoded scenario, for a plug-in a `cz_run_spec_t` and what goes with it, and for whoever is
+ *  refused the reason in words, UTF-8. */
 typedef struct cz_attach_reply {
     /** The `instance` of the request this answers. */
     uint64_t instance;
@@ -433,6 +471,111 @@ CZ_ASSERT_(attach_reply_coordinators_offset, offsetof(cz_attach_reply_t, coordin
 CZ_ASSERT_(attach_reply_controllers_offset, offsetof(cz_attach_reply_t, controllers) == 60);
 CZ_ASSERT_(attach_reply_waiting_offset, offsetof(cz_attach_reply_t, waiting) == 64);
 CZ_ASSERT_(attach_reply_reserved_offset, offsetof(cz_attach_reply_t, reserved) == 68);
+
+/** The numbers of a run: step, limits, distances, and the built-in law's gains.
+ *
+ *  The reply to a plug-in that joins carries one, then `approaches` records of
+ *  `cz_approach_spec_t`, then for each of these a line of UTF-8 text, `ZONE.APPROACH`. */
+typedef struct cz_run_spec {
+    /** Step length, s. */
+    double dt_s;
+    /** The run ends at this instant at the latest, s. */
+    double max_time_s;
+    /** Weight of time against energy, m^2/s^4. */
+    double beta;
+    /** Strongest braking, m/s^2, negative. */
+    double u_min_mps2;
+    /** Strongest acceleration, m/s^2. */
+    double u_max_mps2;
+    /** Least speed, m/s. */
+    double v_min_mps;
+    /** Greatest speed, m/s. */
+    double v_max_mps;
+    /** Reaction time phi, s. */
+    double reaction_time_s;
+    /** Standstill gap delta, m. */
+    double standstill_gap_m;
+    /** Vehicle length, m. */
+    double vehicle_length_m;
+    /** Gain k1 of the rear-end barrier, 1/s. */
+    double k_rear_end_per_s;
+    /** Gain k2 of the merging barrier, 1/s. */
+    double k_merge_per_s;
+    /** Gain of the speed barriers, 1/s. */
+    double k_speed_per_s;
+    /** Rate epsilon of the CLF row, 1/s. */
+    double clf_rate_per_s;
+    /** Weight lambda of the squared slack. */
+    double slack_weight;
+    /** Fraction of the approach within which FE mode may act. */
+    double fe_fraction;
+    /** Step length, ns. Simulated time is `step * dt_ns`. */
+    uint64_t dt_ns;
+    /** Seed of the run's random streams. */
+    uint64_t seed;
+    /** Number of zones. */
+    uint32_t zones;
+    /** Number of approaches, of all zones. */
+    uint32_t approaches;
+    /** Switches of the built-in law, one bit each. */
+    uint32_t law_flags;
+    /** 0 off, 1 observe, 2 on. */
+    uint32_t shield;
+} cz_run_spec_t;
+CZ_ASSERT_(run_spec_size, sizeof(cz_run_spec_t) == 160);
+CZ_ASSERT_ALIGN_(cz_run_spec_t, 8);
+CZ_ASSERT_(run_spec_dt_s_offset, offsetof(cz_run_spec_t, dt_s) == 0);
+CZ_ASSERT_(run_spec_max_time_s_offset, offsetof(cz_run_spec_t, max_time_s) == 8);
+CZ_ASSERT_(run_spec_beta_offset, offsetof(cz_run_spec_t, beta) == 16);
+CZ_ASSERT_(run_spec_u_min_mps2_offset, offsetof(cz_run_spec_t, u_min_mps2) == 24);
+CZ_ASSERT_(run_spec_u_max_mps2_offset, offsetof(cz_run_spec_t, u_max_mps2) == 32);
+CZ_ASSERT_(run_spec_v_min_mps_offset, offsetof(cz_run_spec_t, v_min_mps) == 40);
+CZ_ASSERT_(run_spec_v_max_mps_offset, offsetof(cz_run_spec_t, v_max_mps) == 48);
+CZ_ASSERT_(run_spec_reaction_time_s_offset, offsetof(cz_run_spec_t, reaction_time_s) == 56);
+CZ_ASSERT_(run_spec_standstill_gap_m_offset, offsetof(cz_run_spec_t, standstill_gap_m) == 64);
+CZ_ASSERT_(run_spec_vehicle_length_m_offset, offsetof(cz_run_spec_t, vehicle_length_m) == 72);
+CZ_ASSERT_(run_spec_k_rear_end_per_s_offset, offsetof(cz_run_spec_t, k_rear_end_per_s) == 80);
+CZ_ASSERT_(run_spec_k_merge_per_s_offset, offsetof(cz_run_spec_t, k_merge_per_s) == 88);
+CZ_ASSERT_(run_spec_k_speed_per_s_offset, offsetof(cz_run_spec_t, k_speed_per_s) == 96);
+CZ_ASSERT_(run_spec_clf_rate_per_s_offset, offsetof(cz_run_spec_t, clf_rate_per_s) == 104);
+CZ_ASSERT_(run_spec_slack_weight_offset, offsetof(cz_run_spec_t, slack_weight) == 112);
+CZ_ASSERT_(run_spec_fe_fraction_offset, offsetof(cz_run_spec_t, fe_fraction) == 120);
+CZ_ASSERT_(run_spec_dt_ns_offset, offsetof(cz_run_spec_t, dt_ns) == 128);
+CZ_ASSERT_(run_spec_seed_offset, offsetof(cz_run_spec_t, seed) == 136);
+CZ_ASSERT_(run_spec_zones_offset, offsetof(cz_run_spec_t, zones) == 144);
+CZ_ASSERT_(run_spec_approaches_offset, offsetof(cz_run_spec_t, approaches) == 148);
+CZ_ASSERT_(run_spec_law_flags_offset, offsetof(cz_run_spec_t, law_flags) == 152);
+CZ_ASSERT_(run_spec_shield_offset, offsetof(cz_run_spec_t, shield) == 156);
+
+/** One approach of one zone; zones ascending, then paths. */
+typedef struct cz_approach_spec {
+    /** Distance from the zone's origin to the conflict point, m. */
+    double length_m;
+    /** Length of the link behind the zone's exit, m (0: none). */
+    double link_m;
+    /** Zone index. */
+    uint32_t zone;
+    /** Index of the path within the zone. */
+    uint32_t path;
+    /** Zone the exit leads to, or `CZ_NO_ZONE`. */
+    uint32_t next_zone;
+    /** Path within that zone. */
+    uint32_t next_path;
+    /** Index of the controller process that drives the approach. */
+    uint32_t controller;
+    /** Bit 0: the controller that asked drives it. */
+    uint32_t flags;
+} cz_approach_spec_t;
+CZ_ASSERT_(approach_spec_size, sizeof(cz_approach_spec_t) == 40);
+CZ_ASSERT_ALIGN_(cz_approach_spec_t, 8);
+CZ_ASSERT_(approach_spec_length_m_offset, offsetof(cz_approach_spec_t, length_m) == 0);
+CZ_ASSERT_(approach_spec_link_m_offset, offsetof(cz_approach_spec_t, link_m) == 8);
+CZ_ASSERT_(approach_spec_zone_offset, offsetof(cz_approach_spec_t, zone) == 16);
+CZ_ASSERT_(approach_spec_path_offset, offsetof(cz_approach_spec_t, path) == 20);
+CZ_ASSERT_(approach_spec_next_zone_offset, offsetof(cz_approach_spec_t, next_zone) == 24);
+CZ_ASSERT_(approach_spec_next_path_offset, offsetof(cz_approach_spec_t, next_path) == 28);
+CZ_ASSERT_(approach_spec_controller_offset, offsetof(cz_approach_spec_t, controller) == 32);
+CZ_ASSERT_(approach_spec_flags_offset, offsetof(cz_approach_spec_t, flags) == 36);
 
 #undef CZ_ASSERT_
 #undef CZ_ASSERT_ALIGN_

@@ -11,7 +11,7 @@ import ctypes
 import sys
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0x2a0cc8c48918c06b
+SCHEMA_HASH = 0xfb18d61d5f65d583
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -61,6 +61,8 @@ VERDICT_BOUND = 2
 #: `VehicleCommand.verdict`: no command satisfies all rows; `u_min` was sent.
 VERDICT_INFEASIBLE = 3
 
+#: `AttachRequest.controller`: a process of the built-in pool, or a coordinator.
+BUILT_IN = 0
 #: `AttachRequest.wanted_index`: any free index will do.
 ANY_INDEX = 65535
 #: `AttachRequest.scenario_hash`: no scenario of one's own, take the world's.
@@ -85,6 +87,33 @@ ATTACH_OTHER_SCENARIO = 2
 ATTACH_NO_ROOM = 3
 #: `AttachReply.status`: the request names a role no participant has.
 ATTACH_BAD_ROLE = 4
+#: `AttachReply.status`: the scenario declares no controller of that name.
+ATTACH_NO_CONTROLLER = 5
+
+#: `ApproachSpec.flags`: the controller that asked drives this approach.
+APPROACH_OWN = 1
+#: `RunSpec.law_flags`: the reference trajectory follows the condition as the paper prints it.
+LAW_AS_PRINTED = 1
+#: `RunSpec.law_flags`: a new terminal speed makes a new plan from the present state.
+LAW_REPLAN_FROM_STATE = 2
+#: `RunSpec.law_flags`: the reference time is the exact root of `x*(t_ref) = x`.
+LAW_EXACT_FEEDBACK = 4
+#: `RunSpec.law_flags`: the rear-end row is the one for a command held over the step.
+LAW_SAMPLED_ROWS = 8
+#: `RunSpec.law_flags`: the feasibility rows are present.
+LAW_FEASIBILITY_ROWS = 16
+#: `RunSpec.law_flags`: the CLF row is present.
+LAW_CLF = 32
+#: `RunSpec.law_flags`: FE mode asks only for the barriers.
+LAW_FE_BARRIER = 64
+#: `RunSpec.law_flags`: there is no FE mode.
+LAW_FE_OFF = 128
+#: `RunSpec.shield`: unsafe commands are applied.
+SHIELD_OFF = 0
+#: `RunSpec.shield`: unsafe commands are applied and counted.
+SHIELD_OBSERVE = 1
+#: `RunSpec.shield`: unsafe commands are replaced by the nearest safe ones.
+SHIELD_ON = 2
 
 #: World → controllers: `VehicleState` of every step.
 SERVICE_STATE = "cz/state"
@@ -329,6 +358,8 @@ class AttachRequest(ctypes.Structure):
         instance: Random number that names this participant.
         schema_hash: The participant's schema hash.
         scenario_hash: Hash of the scenario the participant was given, or 0 to take the world's.
+        controller: Which plug-in this is: FNV-1a, 64 bits, of the name the scenario gives it; 0 for
+            a process of the built-in pool.
         process_id: Process id, for liveness checks and messages.
         role: 2 coordinator, 3 controller.
         wanted_index: Index wanted among the processes of the role, or 65535 for any.
@@ -340,6 +371,7 @@ class AttachRequest(ctypes.Structure):
         ("instance", ctypes.c_uint64),
         ("schema_hash", ctypes.c_uint64),
         ("scenario_hash", ctypes.c_uint64),
+        ("controller", ctypes.c_uint64),
         ("process_id", ctypes.c_uint32),
         ("role", ctypes.c_uint16),
         ("wanted_index", ctypes.c_uint16),
@@ -354,7 +386,9 @@ class AttachRequest(ctypes.Structure):
 
 
 class AttachReply(ctypes.Structure):
-    """World → participant: the answer. The payload of the frame is the encoded scenario.
+    """World → participant: the answer. Behind it: for a coordinator or a process of the built-in
+    pool the encoded scenario, for a plug-in a `RunSpec` and what goes with it, and for whoever is
+    refused the reason in words, UTF-8.
 
     Fields:
         instance: The `instance` of the request this answers.
@@ -396,6 +430,99 @@ class AttachReply(ctypes.Structure):
         return "cz.AttachReply.v1"
 
 
+class RunSpec(ctypes.Structure):
+    """The numbers of a run: step, limits, distances, and the built-in law's gains.
+
+    The reply to a plug-in that joins carries one, then `approaches` records of `ApproachSpec`, then
+    for each of these a line of UTF-8 text, `ZONE.APPROACH`.
+
+    Fields:
+        dt_s: Step length, s.
+        max_time_s: The run ends at this instant at the latest, s.
+        beta: Weight of time against energy, m^2/s^4.
+        u_min_mps2: Strongest braking, m/s^2, negative.
+        u_max_mps2: Strongest acceleration, m/s^2.
+        v_min_mps: Least speed, m/s.
+        v_max_mps: Greatest speed, m/s.
+        reaction_time_s: Reaction time phi, s.
+        standstill_gap_m: Standstill gap delta, m.
+        vehicle_length_m: Vehicle length, m.
+        k_rear_end_per_s: Gain k1 of the rear-end barrier, 1/s.
+        k_merge_per_s: Gain k2 of the merging barrier, 1/s.
+        k_speed_per_s: Gain of the speed barriers, 1/s.
+        clf_rate_per_s: Rate epsilon of the CLF row, 1/s.
+        slack_weight: Weight lambda of the squared slack.
+        fe_fraction: Fraction of the approach within which FE mode may act.
+        dt_ns: Step length, ns. Simulated time is `step * dt_ns`.
+        seed: Seed of the run's random streams.
+        zones: Number of zones.
+        approaches: Number of approaches, of all zones.
+        law_flags: Switches of the built-in law, one bit each.
+        shield: 0 off, 1 observe, 2 on.
+    """
+
+    _fields_ = [
+        ("dt_s", ctypes.c_double),
+        ("max_time_s", ctypes.c_double),
+        ("beta", ctypes.c_double),
+        ("u_min_mps2", ctypes.c_double),
+        ("u_max_mps2", ctypes.c_double),
+        ("v_min_mps", ctypes.c_double),
+        ("v_max_mps", ctypes.c_double),
+        ("reaction_time_s", ctypes.c_double),
+        ("standstill_gap_m", ctypes.c_double),
+        ("vehicle_length_m", ctypes.c_double),
+        ("k_rear_end_per_s", ctypes.c_double),
+        ("k_merge_per_s", ctypes.c_double),
+        ("k_speed_per_s", ctypes.c_double),
+        ("clf_rate_per_s", ctypes.c_double),
+        ("slack_weight", ctypes.c_double),
+        ("fe_fraction", ctypes.c_double),
+        ("dt_ns", ctypes.c_uint64),
+        ("seed", ctypes.c_uint64),
+        ("zones", ctypes.c_uint32),
+        ("approaches", ctypes.c_uint32),
+        ("law_flags", ctypes.c_uint32),
+        ("shield", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        """Name under which the transport registers the type."""
+        return "cz.RunSpec.v1"
+
+
+class ApproachSpec(ctypes.Structure):
+    """One approach of one zone; zones ascending, then paths.
+
+    Fields:
+        length_m: Distance from the zone's origin to the conflict point, m.
+        link_m: Length of the link behind the zone's exit, m (0: none).
+        zone: Zone index.
+        path: Index of the path within the zone.
+        next_zone: Zone the exit leads to, or `NO_ZONE`.
+        next_path: Path within that zone.
+        controller: Index of the controller process that drives the approach.
+        flags: Bit 0: the controller that asked drives it.
+    """
+
+    _fields_ = [
+        ("length_m", ctypes.c_double),
+        ("link_m", ctypes.c_double),
+        ("zone", ctypes.c_uint32),
+        ("path", ctypes.c_uint32),
+        ("next_zone", ctypes.c_uint32),
+        ("next_path", ctypes.c_uint32),
+        ("controller", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        """Name under which the transport registers the type."""
+        return "cz.ApproachSpec.v1"
+
+
 #: All record types, in the order the schema hash covers them.
 RECORDS = (
     FrameHeader,
@@ -405,6 +532,8 @@ RECORDS = (
     VehicleCommand,
     AttachRequest,
     AttachReply,
+    RunSpec,
+    ApproachSpec,
 )
 
 #: Name under which the transport registers each record type.
@@ -416,6 +545,8 @@ TYPE_NAMES = {
     "VehicleCommand": "cz.VehicleCommand.v1",
     "AttachRequest": "cz.AttachRequest.v1",
     "AttachReply": "cz.AttachReply.v1",
+    "RunSpec": "cz.RunSpec.v1",
+    "ApproachSpec": "cz.ApproachSpec.v1",
 }
 
 # Size, alignment and field offsets of each record, as Rust has them.
@@ -504,17 +635,18 @@ _LAYOUTS = {
         },
     ),
     AttachRequest: (
-        40,
+        48,
         8,
         {
             "instance": 0,
             "schema_hash": 8,
             "scenario_hash": 16,
-            "process_id": 24,
-            "role": 28,
-            "wanted_index": 30,
-            "phase": 32,
-            "index": 36,
+            "controller": 24,
+            "process_id": 32,
+            "role": 36,
+            "wanted_index": 38,
+            "phase": 40,
+            "index": 44,
         },
     ),
     AttachReply: (
@@ -534,6 +666,48 @@ _LAYOUTS = {
             "controllers": 60,
             "waiting": 64,
             "reserved": 68,
+        },
+    ),
+    RunSpec: (
+        160,
+        8,
+        {
+            "dt_s": 0,
+            "max_time_s": 8,
+            "beta": 16,
+            "u_min_mps2": 24,
+            "u_max_mps2": 32,
+            "v_min_mps": 40,
+            "v_max_mps": 48,
+            "reaction_time_s": 56,
+            "standstill_gap_m": 64,
+            "vehicle_length_m": 72,
+            "k_rear_end_per_s": 80,
+            "k_merge_per_s": 88,
+            "k_speed_per_s": 96,
+            "clf_rate_per_s": 104,
+            "slack_weight": 112,
+            "fe_fraction": 120,
+            "dt_ns": 128,
+            "seed": 136,
+            "zones": 144,
+            "approaches": 148,
+            "law_flags": 152,
+            "shield": 156,
+        },
+    ),
+    ApproachSpec: (
+        40,
+        8,
+        {
+            "length_m": 0,
+            "link_m": 8,
+            "zone": 16,
+            "path": 20,
+            "next_zone": 24,
+            "next_path": 28,
+            "controller": 32,
+            "flags": 36,
         },
     ),
 }

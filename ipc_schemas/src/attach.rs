@@ -6,6 +6,8 @@ use crate::code::codes;
 use crate::record;
 
 codes! {
+    /// [`AttachRequest::controller`]: a process of the built-in pool, or a coordinator.
+    pub const BUILT_IN: u64 = 0;
     /// [`AttachRequest::wanted_index`]: any free index will do.
     pub const ANY_INDEX: u16 = u16::MAX;
     /// [`AttachRequest::scenario_hash`]: no scenario of one's own, take the world's.
@@ -33,14 +35,16 @@ codes! {
     pub const ATTACH_NO_ROOM: u32 = 3;
     /// [`AttachReply::status`]: the request names a role no participant has.
     pub const ATTACH_BAD_ROLE: u32 = 4;
+    /// [`AttachReply::status`]: the scenario declares no controller of that name.
+    pub const ATTACH_NO_CONTROLLER: u32 = 5;
 }
 
 record! {
     /// Participant → world: let me in; later, I am ready.
     ///
     /// Repeated until answered. The other services are opened only between the two, so that a
-    /// participant of another schema is refused before its frames could be misread. `instance` is drawn at random by the participant and tells its
-    /// answer from those to others.
+    /// participant of another schema is refused before its frames could be misread. `instance` is drawn at
+    /// random by the participant and tells its answer from those to others.
     #[type_name("cz.AttachRequest.v1")]
     pub struct AttachRequest {
         /// Random number that names this participant.
@@ -49,6 +53,9 @@ record! {
         pub schema_hash: u64,
         /// Hash of the scenario the participant was given, or 0 to take the world's.
         pub scenario_hash: u64,
+        /// Which plug-in this is: FNV-1a, 64 bits, of the name the scenario gives it; 0 for a process
+        /// of the built-in pool.
+        pub controller: u64,
         /// Process id, for liveness checks and messages.
         pub process_id: u32,
         /// 2 coordinator, 3 controller.
@@ -63,7 +70,9 @@ record! {
 }
 
 record! {
-    /// World → participant: the answer. The payload of the frame is the encoded scenario.
+    /// World → participant: the answer. Behind it: for a coordinator or a process of the
+    /// built-in pool the encoded scenario, for a plug-in a `RunSpec` and what goes with it, and for
+    /// whoever is refused the reason in words, UTF-8.
     #[type_name("cz.AttachReply.v1")]
     pub struct AttachReply {
         /// The `instance` of the request this answers.

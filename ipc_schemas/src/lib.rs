@@ -13,6 +13,7 @@ mod coordination;
 pub mod generate;
 mod header;
 pub mod record;
+mod run_spec;
 mod services;
 mod state;
 mod summary;
@@ -24,6 +25,7 @@ pub use command::*;
 pub use coordination::*;
 pub use header::*;
 pub use record::{Field, Layout, Record, Scalar, bytes_of};
+pub use run_spec::*;
 pub use services::*;
 pub use state::*;
 pub use summary::*;
@@ -32,7 +34,7 @@ pub use summary::*;
 compile_error!("frames are little-endian and are used in place");
 
 /// The layouts of all record types, in the order the schema hash covers them.
-pub const LAYOUTS: [Layout; 7] = [
+pub const LAYOUTS: [Layout; 9] = [
     FrameHeader::LAYOUT,
     VehicleState::LAYOUT,
     Assignment::LAYOUT,
@@ -40,14 +42,23 @@ pub const LAYOUTS: [Layout; 7] = [
     VehicleCommand::LAYOUT,
     AttachRequest::LAYOUT,
     AttachReply::LAYOUT,
+    RunSpec::LAYOUT,
+    ApproachSpec::LAYOUT,
 ];
 
 /// All public codes, flags and service names, one table per module that declares some.
 ///
 /// Not part of the schema hash: a new code does not change a layout. Changing the meaning of an old one
 /// is a new version of the record that carries it.
-pub const CODES: [&[Code]; 6] =
-    [header::CODES, state::CODES, coordination::CODES, command::CODES, attach::CODES, services::CODES];
+pub const CODES: [&[Code]; 7] = [
+    header::CODES,
+    state::CODES,
+    coordination::CODES,
+    command::CODES,
+    attach::CODES,
+    run_spec::CODES,
+    services::CODES,
+];
 
 /// The canonical text of the schema: one line per record and field.
 pub fn schema_text() -> String {

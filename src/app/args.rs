@@ -36,6 +36,16 @@ pub(super) enum Command {
     Reproduce(ReproduceArgs),
     /// Measure latency, the solver, or scale on this machine.
     Bench(BenchArgs),
+    /// Controllers of your own: check one against the contract, or numbers against the law.
+    Plugin {
+        #[command(subcommand)]
+        command: PluginCommand,
+    },
+    /// What controllers in C and C++ are built against.
+    Sdk {
+        #[command(subcommand)]
+        command: SdkCommand,
+    },
 }
 
 #[derive(Debug, Args)]
@@ -89,6 +99,34 @@ impl PeerScenarioArgs {
         let (seed, set) = (self.seed, self.set.clone());
         ScenarioArgs { scenario: None, seed, set, corridors: None }.load()
     }
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum PluginCommand {
+    /// Start a controller against a scripted world and report, rule by rule, whether it keeps the contract.
+    Check {
+        /// Time within which each step is to be answered, ms.
+        #[arg(long, value_name = "MS", default_value_t = 100.0)]
+        deadline_ms: f64,
+        /// Print JSON.
+        #[arg(long)]
+        json: bool,
+        /// The controller's command line, after `--`.
+        #[arg(last = true, required = true, value_name = "COMMAND")]
+        command: Vec<String>,
+    },
+    /// Print test vectors of the paper's law as JSON: trajectories, rows and commands.
+    Golden,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum SdkCommand {
+    /// Install headers, libraries, and files for pkg-config and CMake.
+    Install {
+        /// Directory to install under.
+        #[arg(long, value_name = "DIR")]
+        prefix: PathBuf,
+    },
 }
 
 /// A program of its own around the arguments of a subcommand.
@@ -180,6 +218,13 @@ impl ShareArgs {
                 )));
             }
         }
+        let (controllers, plugins) = (scenario.controllers(self.ctrl_procs), scenario.plugins.len());
+        if controllers > MAX_CONTROLLERS {
+            return Err(super::AppError::Usage(format!(
+                "--ctrl-procs {}: with the scenario's {plugins} controllers, expected at most {MAX_CONTROLLERS}",
+                self.ctrl_procs
+            )));
+        }
         Ok(())
     }
 }
@@ -214,11 +259,19 @@ pub(super) struct RunArgs {
     pub in_process: bool,
     #[command(flatten)]
     pub share: ShareArgs,
+    /// Let a program of your own drive zones or approaches, e.g. `--controller merge-2="python3 mine.py"`;
+    /// may be repeated. TARGET is a list such as `merge-1,merge-2.main`, or the name of a controller that
+    /// the scenario declares.
+    #[arg(long = "controller", value_name = "TARGET=COMMAND")]
+    pub controllers: Vec<String>,
+    /// What becomes of commands that are not safe, in place of the scenario's `shield`: off, observe, on.
+    #[arg(long, value_name = "MODE")]
+    pub shield: Option<String>,
     /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,
     /// Name of the run; runs of different names do not see each other [default: one of its own].
-    #[arg(long, value_name = "NAME", conflicts_with = "in_process")]
+    #[arg(long, value_name = "NAME")]
     pub run: Option<RunName>,
     #[command(flatten)]
     pub wait: WaitArgs,

@@ -67,6 +67,8 @@ fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, S
         run: own_name(),
         scenario,
         share: ShareArgs { ctrl_procs: controllers, coord_procs: 1 },
+        plugins: &[],
+        pool: controllers,
         wait: WAIT,
         wait_mode: WaitMode::Hybrid,
     };

@@ -2,10 +2,14 @@
 
 mod args;
 mod bench;
+mod controllers;
+mod golden;
 mod parts;
 mod plan;
+mod plugin;
 mod report;
 mod run;
+mod sdk;
 mod supervise;
 
 use crate::process::ProcessError;
@@ -78,6 +82,8 @@ pub fn cz() -> ExitCode {
             args::Command::Plan(args) => plan::plan(&args),
             args::Command::Reproduce(args) => reproduce::cli::main(&args).map_err(AppError::from),
             args::Command::Bench(args) => bench::bench(&args),
+            args::Command::Plugin { command } => plugin::plugin(&command),
+            args::Command::Sdk { command } => sdk::sdk(&command),
         },
     )
 }

@@ -23,7 +23,7 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     let options = WorldOptions {
         run: args.run.clone(),
         coordinators: args.share.coord_procs,
-        controllers: args.share.ctrl_procs,
+        controllers: scenario.controllers(args.share.ctrl_procs),
         attach_timeout: args.wait.attach_timeout,
         peer_timeout: args.wait.peer_timeout,
         wait: args.wait_mode,

@@ -2,8 +2,8 @@
 
 use super::{AppError, print};
 use crate::process::{LatencyUs, Outcome};
-use crate::scenario::Scenario;
-use crate::world::ZoneSummaryRow;
+use crate::scenario::{Scenario, ShieldMode};
+use crate::world::{ShieldSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
 use serde::Serialize;
 use std::path::Path;
@@ -27,6 +27,7 @@ pub(super) struct Summary {
     departed: u32,
     held_arrivals: u32,
     waiting: u32,
+    shield: ShieldSummary,
 }
 
 /// How the frames of a run travelled.
@@ -60,6 +61,7 @@ impl Summary {
             departed: world.departed,
             held_arrivals: world.held_arrivals,
             waiting: world.waiting,
+            shield: world.shield,
         }
     }
 
@@ -143,8 +145,37 @@ impl Summary {
                 self.arrived - self.departed
             ));
         }
+        shield_lines(&self.shield, &mut text);
         text.push_str(&format!("state hash {}\n", self.state_hash));
         text
+    }
+}
+
+/// One line per controller the shield had something to say about.
+fn shield_lines(shield: &ShieldSummary, text: &mut String) {
+    if shield.mode == ShieldMode::Off {
+        return;
+    }
+    for row in &shield.controllers {
+        let acts = row.not_finite + row.limits + row.speed + row.rear_end + row.merge;
+        text.push_str(&format!(
+            "shield {}, {}: {acts} of {} commands bounded (rear end {}, merge {}, speed {}, limits {}, no \
+             number {}); least margins of guaranteed vehicles {} / {} m; {} pairs began unsafe\n",
+            shield.mode.name(),
+            row.controller,
+            row.commands,
+            row.rear_end,
+            row.merge,
+            row.speed,
+            row.limits,
+            row.not_finite,
+            metres(row.min_rear_end_margin_m),
+            metres(row.min_merge_margin_m),
+            row.began_unsafe
+        ));
+        if row.lost > 0 {
+            text.push_str(&format!("  {} vehicle-steps of guaranteed vehicles ended unsafe\n", row.lost));
+        }
     }
 }
 

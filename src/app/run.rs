@@ -1,9 +1,9 @@
 //! `cz run`: a whole run, in this process or in several.
 
-use super::AppError;
 use super::args::RunArgs;
 use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
+use super::{AppError, controllers};
 use crate::process::{StopFlag, WaitMode, check_cores, run_in_process};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
@@ -12,10 +12,17 @@ use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::sync::Arc;
 
 pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
-    let scenario = Arc::new(args.scenario.load()?);
+    let mut arguments = args.scenario.clone();
+    arguments.set.extend(args.shield.iter().map(|mode| format!("shield={mode}")));
+    let (arguments, scenario) = controllers::load(&arguments, &args.controllers)?;
+    let scenario = Arc::new(scenario);
     args.share.check(&scenario)?;
     if args.wait_mode == WaitMode::Spin && !args.in_process {
         check_cores(1 + (args.share.coord_procs + args.share.ctrl_procs) as usize)?;
+    }
+    if args.in_process && !scenario.plugins.is_empty() {
+        let problem = "--in-process: the scenario has controllers that are processes of their own";
+        return Err(AppError::Usage(problem.to_owned()));
     }
     let bar = Bar::new(&scenario);
     let (transport, outcome) = if args.in_process {
@@ -26,10 +33,12 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         });
         (Transport::InProcess, outcome.map_err(AppError::from))
     } else {
-        let processes = 1 + args.share.coord_procs + args.share.ctrl_procs;
+        let processes = 1 + args.share.coord_procs + scenario.controllers(args.share.ctrl_procs);
         let plan = Plan {
             run: args.run.clone().unwrap_or_else(own_name),
-            scenario: &args.scenario,
+            scenario: &arguments,
+            plugins: &scenario.plugins,
+            pool: scenario.controllers(args.share.ctrl_procs) - scenario.plugins.len() as u32,
             share: args.share,
             wait: args.wait,
             wait_mode: args.wait_mode,

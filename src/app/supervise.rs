@@ -4,14 +4,15 @@ use super::AppError;
 use super::args::{ScenarioArgs, ShareArgs, WaitArgs};
 use super::run::Position;
 use crate::process::{Outcome, ProcessError, WaitMode};
+use crate::scenario::Plugin;
 use crate::transport::iox::{RunName, RunSpace};
 use crate::world::World;
 use clap::ValueEnum;
 use crossbeam::channel::{Receiver, Sender, select, unbounded};
-use rustix::process::{Pid, Signal, kill_process};
+use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 use serde::{Deserialize, Serialize};
 use std::io::{BufRead, BufReader};
-use std::os::unix::process::ExitStatusExt;
+use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
@@ -37,6 +38,10 @@ pub(super) struct Plan<'a> {
     pub share: ShareArgs,
     pub wait: WaitArgs,
     pub wait_mode: WaitMode,
+    /// Controllers written elsewhere.
+    pub plugins: &'a [Plugin],
+    /// Number of processes of the built-in pool.
+    pub pool: u32,
 }
 
 /// How long the others may take to end by themselves once one has failed, and once asked to.
@@ -57,7 +62,7 @@ pub(super) fn supervise(plan: &Plan<'_>, progress: impl FnMut(Position)) -> Resu
 
     claim(&plan.run)?;
     let (events, inbox) = unbounded();
-    let mut family = Family { children: Vec::new(), events };
+    let mut family = Family { children: Vec::new(), plugins: Vec::new(), events };
     let result = family.start(plan).and_then(|()| family.watch(&inbox, &signals, progress));
     if result.is_err() {
         family.end(&inbox);
@@ -95,6 +100,8 @@ enum Event {
 /// The child processes.
 struct Family {
     children: Vec<Member>,
+    /// Which of them are controllers written elsewhere, each leading a process group.
+    plugins: Vec<usize>,
     events: Sender<Event>,
 }
 
@@ -123,7 +130,7 @@ impl Family {
         world.extend(plan.scenario.to_arguments());
         self.spawn("world".to_owned(), "world", world)?;
         for (role, command, count) in
-            [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.share.ctrl_procs)]
+            [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
         {
             for index in 0..count {
                 let mut arguments = common.clone();
@@ -131,6 +138,40 @@ impl Family {
                 self.spawn(format!("{role} {index}"), command, arguments)?;
             }
         }
+        for plugin in plan.plugins {
+            if let Some(command) = &plugin.command {
+                self.spawn_plugin(&plan.run, &plugin.name, command)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Starts a controller written elsewhere, through the shell, in a process group of its own so that
+    /// whatever the shell starts is ended with it. What it says goes to stderr under its name.
+    fn spawn_plugin(&mut self, run: &RunName, name: &str, command: &str) -> Result<(), AppError> {
+        let mut child = Command::new("sh")
+            .args(["-c", command])
+            .env("CZ_RUN", run.to_string())
+            .env("CZ_CONTROLLER", name)
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .process_group(0)
+            .spawn()
+            .map_err(|e| AppError::Failed(format!("cannot start controller {name}: {e}")))?;
+        let index = self.children.len();
+        let member =
+            Member { name: format!("controller {name}"), pid: child.id(), running: true, last_words: None };
+        self.children.push(member);
+        let prefix = name.to_owned();
+        let stdout = child.stdout.take();
+        std::thread::spawn(move || {
+            for line in stdout.into_iter().flat_map(|s| BufReader::new(s).lines().map_while(Result::ok)) {
+                eprintln!("[{prefix}] {line}");
+            }
+        });
+        self.plugins.push(index);
+        self.listen(index, &mut child);
         Ok(())
     }
 
@@ -197,7 +238,12 @@ impl Family {
                 recv(inbox) -> event => match event.expect("the family holds a sender") {
                     Event::Line { line: WorldLine::Progress(position) } => progress(position),
                     Event::Line { line: WorldLine::Outcome(result) } => outcome = Some(*result),
-                    Event::Said { child, line } => self.children[child].last_words = Some(line),
+                    Event::Said { child, line } => {
+                        if self.plugins.contains(&child) {
+                            eprintln!("[{}] {line}", self.children[child].name);
+                        }
+                        self.children[child].last_words = Some(line);
+                    }
                     Event::Ended { child, status } => {
                         let member = &mut self.children[child];
                         member.running = false;
@@ -229,9 +275,13 @@ impl Family {
     /// Ends whoever still runs: asks first, insists after a grace period.
     fn end(&mut self, inbox: &Receiver<Event>) {
         for signal in [Signal::TERM, Signal::KILL] {
-            for child in self.children.iter().filter(|c| c.running) {
+            for (i, child) in self.children.iter().enumerate().filter(|(_, c)| c.running) {
                 if let Some(pid) = Pid::from_raw(child.pid as i32) {
-                    let _ = kill_process(pid, signal);
+                    let _ = if self.plugins.contains(&i) {
+                        kill_process_group(pid, signal)
+                    } else {
+                        kill_process(pid, signal)
+                    };
                 }
             }
             let deadline = Instant::now() + GRACE;

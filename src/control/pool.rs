@@ -16,6 +16,8 @@ pub struct ControllerPool {
     law: Law,
     zones: Range<ZoneId>,
     crews: Vec<Crew>,
+    /// Approaches of these zones that plug-ins drive.
+    plugged: Vec<(ZoneId, u32)>,
 }
 
 /// The vehicles of one zone, aligned with the zone's members in the state frame.
@@ -107,12 +109,15 @@ impl ControllerPool {
     /// A pool for the given zones.
     pub fn new(scenario: Arc<Scenario>, zones: Range<ZoneId>) -> ControllerPool {
         let crews = zones.clone().map(|_| Crew::default()).collect();
-        ControllerPool { law: Law::new(&scenario), scenario, zones, crews }
+        let plugged = scenario.plugins.iter().flat_map(|p| p.approaches.iter().copied());
+        let plugged = plugged.filter(|(zone, _)| zones.contains(zone)).collect();
+        ControllerPool { law: Law::new(&scenario), scenario, zones, crews, plugged }
     }
 
     /// The number of commands a state frame asks of this pool.
     pub fn command_count(&self, states: &[VehicleState]) -> usize {
-        self.own(states).iter().filter(|s| s.flags & frames::STATE_LEFT == 0).count()
+        let own = self.own(states).iter().filter(|s| s.flags & frames::STATE_LEFT == 0);
+        own.filter(|s| !self.is_plugged(s)).count()
     }
 
     /// Takes a coordination frame; assignments of other pools' zones are skipped.
@@ -185,6 +190,9 @@ impl ControllerPool {
                 if state.vehicle != member.vehicle {
                     return Err(unassigned);
                 }
+                if !self.plugged.is_empty() && self.plugged.contains(&(zone, state.path)) {
+                    continue;
+                }
                 let situation = Situation {
                     time_s,
                     x_m: state.x_m,
@@ -201,6 +209,11 @@ impl ControllerPool {
             }
         }
         Ok(())
+    }
+
+    /// Whether a plug-in drives the vehicle.
+    fn is_plugged(&self, state: &VehicleState) -> bool {
+        !self.plugged.is_empty() && self.plugged.contains(&(state.zone, state.path))
     }
 
     fn own_range(&self, states: &[VehicleState]) -> Range<usize> {

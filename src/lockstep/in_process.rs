@@ -33,8 +33,10 @@ pub struct InProcess {
 }
 
 impl InProcess {
-    /// A run of the scenario with that many coordinator and controller roles.
+    /// A run of the scenario with that many coordinator and controller roles. The built-in law stands in
+    /// for every plug-in.
     pub fn new(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32) -> InProcess {
+        let scenario = &Arc::new(scenario.without_plugins());
         let zones = scenario.network.zones.len() as u32;
         let run_id = 1;
         let mut state = MemoryService::new(frames::SERVICE_STATE);

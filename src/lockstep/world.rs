@@ -44,11 +44,12 @@ where
 {
     /// A driver at the world's present step.
     pub fn new(
-        world: World,
+        mut world: World,
         ports: WorldPorts<S, C, M>,
         run_id: u64,
         controllers: u32,
     ) -> WorldDriver<S, C, M> {
+        world.share_out(controllers);
         WorldDriver {
             world,
             ports,
@@ -138,7 +139,7 @@ where
         if u32::from(index) >= self.controllers || missing >> index & 1 == 0 {
             return Err(LockstepError::Unexpected { sender: sender(header), step });
         }
-        self.world.command(frame.records()).map_err(|fault| LockstepError::Command {
+        self.world.command(u32::from(index), frame.records()).map_err(|fault| LockstepError::Command {
             step,
             sender: sender(header),
             fault,

@@ -1,8 +1,9 @@
 //! How participants join a run, on both sides.
 
 use super::peers::is_alive;
-use super::{Peer, Peers, ProcessError, StopFlag, WorldOptions};
-use crate::scenario::{Scenario, decode, scenario_hash};
+use super::run_spec::plugin_bytes;
+use super::{Peer, Peers, ProcessError, StopFlag, WaitMode};
+use crate::scenario::{Drivers, Scenario, decode, scenario_hash};
 use crate::transport::TransportError;
 use crate::transport::iox::{AttachDesk, AttachLine, RunName, RunSpace, SpaceError};
 use ipc_schemas::{self as frames, AttachReply, AttachRequest, Role, schema_hash};
@@ -70,12 +71,13 @@ impl Attachment {
             process_id: std::process::id(),
             role: joining.role as u16,
             wanted_index: joining.index.unwrap_or(frames::ANY_INDEX),
+            controller: frames::BUILT_IN,
             phase: frames::ATTACH_JOIN,
             index: 0,
         };
         let (reply, bytes) = exchange(&line, request, deadline, stop, &no_world)?;
         if reply.status != frames::ATTACH_ACCEPTED {
-            let reason = refusal(&request, &reply);
+            let reason = String::from_utf8_lossy(&bytes).into_owned();
             return Err(ProcessError::Refused { run: run.to_string(), role: joining.role, reason });
         }
         let scenario = Arc::new(decode(&bytes)?);
@@ -135,7 +137,8 @@ fn pause(
     Ok(())
 }
 
-fn refusal(request: &AttachRequest, reply: &AttachReply) -> String {
+/// Why a participant is refused, in words that travel behind the reply.
+fn refusal(request: &AttachRequest, reply: &AttachReply, plugins: &str) -> String {
     match reply.status {
         frames::ATTACH_OTHER_SCHEMA => format!(
             "its frames have schema {:016x}, the world's have {:016x}; build both from the same version",
@@ -153,6 +156,12 @@ fn refusal(request: &AttachRequest, reply: &AttachReply) -> String {
             format!("all places are taken; the run has {c} coordinator and {k} controller processes")
         }
         frames::ATTACH_BAD_ROLE => format!("it asked for role {}, which nobody has", request.role),
+        frames::ATTACH_NO_CONTROLLER if plugins.is_empty() => {
+            "the scenario declares no controllers; add a [[controllers]] table".to_owned()
+        }
+        frames::ATTACH_NO_CONTROLLER => {
+            format!("the scenario declares no controller of that name, only {plugins}")
+        }
         other => format!("status {other}"),
     }
 }
@@ -167,6 +176,16 @@ pub(super) struct Reception {
     waiting: u32,
     coordinators: Vec<Option<Seat>>,
     controllers: Vec<Option<Seat>>,
+    /// Number of seats of the built-in pool, which come first.
+    pool: usize,
+    /// Name hash, and the bytes behind the reply, of each plug-in.
+    plugins: Vec<(u64, Vec<u8>)>,
+    plugin_names: String,
+    /// What a plug-in that joins is told: 0 and 0, but for a restarted one.
+    pub(super) generation: u32,
+    pub(super) first_step: u64,
+    /// Why somebody was refused last.
+    pub(super) last_refusal: Option<String>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -181,16 +200,28 @@ impl Reception {
         space: &RunSpace,
         scenario: &Scenario,
         run_id: u64,
-        options: &WorldOptions,
+        (coordinators, controllers): (u32, u32),
+        wait: WaitMode,
     ) -> Result<Reception, SpaceError> {
-        let WorldOptions { coordinators, controllers, .. } = *options;
         let bytes = crate::scenario::encode(scenario);
+        let drivers = Drivers::new(scenario, controllers);
+        let plugins: Vec<_> = (drivers.pool()..)
+            .zip(&scenario.plugins)
+            .map(|(index, plugin)| (plugin.name_hash(), plugin_bytes(scenario, &drivers, index)))
+            .collect();
+        let longest = plugins.iter().map(|(_, b)| b.len()).max().unwrap_or(0).max(bytes.len());
         Ok(Reception {
-            desk: space.create_attach_desk((coordinators + controllers) as usize, bytes.len())?,
+            desk: space.create_attach_desk((coordinators + controllers) as usize, longest)?,
+            pool: drivers.pool() as usize,
+            plugins,
+            generation: 0,
+            first_step: 0,
+            last_refusal: None,
+            plugin_names: scenario.plugins.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", "),
             run_id,
             scenario_hash: scenario_hash(scenario),
             scenario: bytes,
-            waiting: options.wait.code(),
+            waiting: wait.code(),
             coordinators: vec![None; coordinators as usize],
             controllers: vec![None; controllers as usize],
         })
@@ -205,18 +236,27 @@ impl Reception {
                 run_id: self.run_id,
                 schema_hash: schema_hash(),
                 scenario_hash: self.scenario_hash,
-                first_step: 0,
+                first_step: self.first_step,
                 status,
                 world_process_id: std::process::id(),
-                generation: 0,
+                generation: self.generation,
                 index,
                 coordinators: self.coordinators.len() as u32,
                 controllers: self.controllers.len() as u32,
                 waiting: self.waiting,
                 reserved: 0,
             };
-            let scenario = if status == frames::ATTACH_ACCEPTED { &self.scenario[..] } else { &[] };
-            self.desk.reply(reply, scenario)?;
+            let reason;
+            let behind = if status != frames::ATTACH_ACCEPTED {
+                reason = refusal(&request, &reply, &self.plugin_names);
+                self.last_refusal = Some(reason.clone());
+                reason.as_bytes()
+            } else if request.controller == frames::BUILT_IN {
+                &self.scenario[..]
+            } else {
+                &self.plugins[index as usize - self.pool].1
+            };
+            self.desk.reply(reply, behind)?;
         }
         Ok(())
     }
@@ -228,9 +268,20 @@ impl Reception {
         if request.scenario_hash != frames::ANY_SCENARIO && request.scenario_hash != self.scenario_hash {
             return (frames::ATTACH_OTHER_SCENARIO, 0);
         }
+        let mut first = 0;
         let seats = match Role::from_code(request.role) {
-            Some(Role::Coordinator) => &mut self.coordinators,
-            Some(Role::Controller) => &mut self.controllers,
+            Some(Role::Coordinator) => &mut self.coordinators[..],
+            Some(Role::Controller) if request.controller == frames::BUILT_IN => {
+                &mut self.controllers[..self.pool]
+            }
+            Some(Role::Controller) => {
+                let Some(plugin) = self.plugins.iter().position(|(hash, _)| *hash == request.controller)
+                else {
+                    return (frames::ATTACH_NO_CONTROLLER, 0);
+                };
+                first = self.pool + plugin;
+                &mut self.controllers[first..=first]
+            }
             _ => return (frames::ATTACH_BAD_ROLE, 0),
         };
         let own = seats.iter().position(|s| s.is_some_and(|s| s.instance == request.instance));
@@ -238,7 +289,7 @@ impl Reception {
         let place = own.or_else(|| match request.wanted_index {
             frames::ANY_INDEX => seats.iter().position(free),
             wanted => {
-                let wanted = usize::from(wanted);
+                let wanted = usize::from(wanted).wrapping_sub(first);
                 seats.get(wanted).is_some_and(free).then_some(wanted)
             }
         });
@@ -249,7 +300,7 @@ impl Reception {
             process_id: request.process_id,
             ready: ready || seats[place].is_some_and(|s| s.instance == request.instance && s.ready),
         });
-        (frames::ATTACH_ACCEPTED, place as u32)
+        (frames::ATTACH_ACCEPTED, (first + place) as u32)
     }
 
     /// The first participant that is not ready, or died since: its role and index.
@@ -259,6 +310,25 @@ impl Reception {
         missing(&self.coordinators)
             .map(|i| (Role::Coordinator, i))
             .or_else(|| missing(&self.controllers).map(|i| (Role::Controller, i)))
+    }
+
+    /// What to call a participant.
+    pub(super) fn name_of(&self, role: Role, index: usize) -> String {
+        let plugin = (role == Role::Controller).then(|| index.checked_sub(self.pool)).flatten();
+        match plugin.and_then(|i| self.plugin_names.split(", ").nth(i)) {
+            Some(name) => format!("controller {name} (attaching as CZ_CONTROLLER={name})"),
+            None => format!("{role} {index}"),
+        }
+    }
+
+    /// Whether a controller is ready.
+    pub(super) fn is_ready(&self, controller: usize) -> bool {
+        self.controllers[controller].is_some_and(|s| s.ready)
+    }
+
+    /// Frees the place of a controller that has been ended.
+    pub(super) fn vacate(&mut self, controller: usize) {
+        self.controllers[controller] = None;
     }
 
     /// All participants.

@@ -4,6 +4,8 @@ mod attach;
 mod participant;
 mod peers;
 mod placement;
+pub mod plugin_check;
+mod run_spec;
 mod stop;
 mod wait;
 mod world;
@@ -12,6 +14,7 @@ pub use attach::{Attachment, Joining};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
 pub use placement::{Affinity, Placement, place, unplaced};
+pub use run_spec::plugin_bytes;
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{

@@ -76,6 +76,8 @@ pub fn run_controller(
     let bell = wait.has_bell(Role::Controller).then(own_bell).flatten();
     place(placement, Role::Controller, index);
     let scenario = &attachment.scenario;
+    // Plug-ins come behind the processes of the pool.
+    let pool = controllers - scenario.plugins.len() as u32;
     let zones = scenario.network.zones.len() as u32;
     let ports = ControllerPorts {
         state: space.open(frames::SERVICE_STATE)?.inbox()?,
@@ -85,7 +87,7 @@ pub fn run_controller(
             .outbox(expected_vehicles(scenario))?
             .ringing(wait.has_bell(Role::World).then(|| space.bell_rope(frames::BELL_WORLD)).flatten()),
     };
-    let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, controllers));
+    let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
     let identity = identity(&attachment.reply, Role::Controller);
     let mut driver = ControllerDriver::new(role, ports, identity, first_step);
     attachment.ready(stop)?;

@@ -193,8 +193,10 @@ pub fn run_world(
     // The desk last: once it exists, everything else does.
     let services = Services::create(&space, scenario, coordinators, controllers).map_err(active)?;
     let _bells = create_bells(&space, wait, coordinators, controllers)?;
-    let bell = wait.has_bell(Role::World).then(|| space.bell(frames::BELL_WORLD)).flatten();
-    let mut reception = Reception::open(&space, scenario, run_id, options).map_err(active)?;
+    // Plug-ins ring no bells: with one in the run, the world polls.
+    let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
+    let bell = rung.then(|| space.bell(frames::BELL_WORLD)).flatten();
+    let mut reception = Reception::open(&space, scenario, run_id, (coordinators, controllers), wait).map_err(active)?;
     receive_all(&mut reception, options, stop)?;
     // Bells are hung up by now, so that the ropes hold.
     let ports = services.world_ports(&space, scenario, wait)?;
@@ -265,7 +267,7 @@ fn receive_all(
         if Instant::now() >= deadline {
             return Err(ProcessError::Missing {
                 run: options.run.to_string(),
-                missing: format!("{role} {index}"),
+                missing: reception.name_of(role, index),
                 command: if role == Role::Coordinator { "cz-coord" } else { "cz-ctrl" },
                 seconds: options.attach_timeout.as_secs_f64(),
             });

@@ -8,6 +8,7 @@ mod demand;
 mod document;
 mod error;
 mod overrides;
+mod plugins;
 mod sections;
 mod table;
 mod topology;
@@ -15,7 +16,7 @@ mod topology;
 pub use error::{Place, ScenarioError};
 pub use overrides::Override;
 
-use super::{Network, Road, Scenario, embedded};
+use super::{Network, Road, Scenario, ShieldMode, embedded};
 use demand::{DemandReader, MAX_TIME_S, TraceBase};
 use document::{Document, Node, Origin, Value};
 use std::collections::BTreeMap;
@@ -97,7 +98,19 @@ fn load_text(
 
 fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError> {
     let root = Table::root(document);
-    root.only(&["name", "seed", "dt_s", "end", "vehicle", "objective", "control", "roads", "zones"])?;
+    root.only(&[
+        "name",
+        "seed",
+        "dt_s",
+        "end",
+        "vehicle",
+        "objective",
+        "control",
+        "shield",
+        "roads",
+        "zones",
+        "controllers",
+    ])?;
     let name = root.name()?.to_owned();
     let seed = match root.get("seed") {
         Some(field) => field.integer(0, "an integer from 0 to 2^64 - 1")?,
@@ -147,8 +160,25 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         let demand = reader.read(index as u32, table)?;
         roads.push(Road { name: reader.roads[index].to_owned(), zone, path, demand });
     }
+    let plugins = plugins::read(&root, &topology.zones)?;
+    let shield = root.choice_or_first(
+        "shield",
+        &[("off", ShieldMode::Off), ("observe", ShieldMode::Observe), ("on", ShieldMode::On)],
+    )?;
     let network = Network { zones: topology.zones, roads };
-    Ok(Scenario { name, seed, dt_ns, max_vehicles, max_time_s, network, vehicle, control, beta })
+    Ok(Scenario {
+        name,
+        seed,
+        dt_ns,
+        max_vehicles,
+        max_time_s,
+        network,
+        vehicle,
+        control,
+        beta,
+        plugins,
+        shield,
+    })
 }
 
 /// `dt_s` as nanoseconds.

@@ -10,6 +10,7 @@ pub mod encode;
 pub mod load;
 pub mod network;
 pub mod params;
+pub mod plugins;
 pub mod share;
 
 pub use arrivals::ArrivalStream;
@@ -21,6 +22,7 @@ pub use params::{
     Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
     Segment, Solver, VehicleParams,
 };
+pub use plugins::{Drivers, Plugin, ShieldMode};
 
 use serde::{Deserialize, Serialize};
 
@@ -46,6 +48,10 @@ pub struct Scenario {
     pub control: ControlParams,
     /// Weight of time against energy, m^2/s^4 (paper: beta in `eqn:energyobj`).
     pub beta: f64,
+    /// Controllers written elsewhere; the built-in pool drives the rest.
+    pub plugins: Vec<Plugin>,
+    /// What the gateway does with unsafe commands.
+    pub shield: ShieldMode,
 }
 
 impl Scenario {

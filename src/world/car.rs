@@ -13,6 +13,8 @@ pub(super) struct Car {
     pub v_mps: f64,
     /// Acceleration an observer saw over the step just ended, m/s^2.
     pub u_mps2: f64,
+    /// Acceleration commanded for the coming step, once shielded, m/s^2.
+    pub command_mps2: f64,
     /// Motion over the coming step, set by the vehicle's command (on a link: by its driver).
     pub held: Held,
     pub entry_time_s: f64,
@@ -35,6 +37,16 @@ pub(super) struct Visit {
     pub clean_rear_end: bool,
     pub clean_merge: bool,
     pub least_rear_end_m: f64,
+    /// What the shield holds the vehicle to.
+    pub rear_end: Guard,
+    pub merge: Guard,
+}
+
+/// Whether a vehicle was safe toward a partner when it came to owe it something.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Guard {
+    pub partner: Option<u32>,
+    pub safe: bool,
 }
 
 impl Visit {
@@ -45,6 +57,8 @@ impl Visit {
         clean_rear_end: true,
         clean_merge: true,
         least_rear_end_m: f64::INFINITY,
+        rear_end: Guard { partner: None, safe: false },
+        merge: Guard { partner: None, safe: false },
     };
 }
 
@@ -58,6 +72,7 @@ impl Car {
             x_m: 0.0,
             v_mps: entry_speed_mps,
             u_mps2: 0.0,
+            command_mps2: 0.0,
             held: Held::new(0.0, entry_speed_mps, 0.0),
             entry_time_s,
             entry_speed_mps,

@@ -2,7 +2,7 @@
 
 use super::car::{Car, LeftCar, Visit};
 use super::gate::may_enter;
-use super::link::{self, Link};
+use super::link::Link;
 use super::metrics::{CompletedVisit, ZoneMetrics};
 use super::role::{Traffic, World};
 use crate::scenario::{Exit, Scenario, Zone};
@@ -21,12 +21,11 @@ impl World {
         let scenario = self.scenario.clone();
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
-        self.drive_links(&scenario, dt_s);
+        self.hold_all(&scenario, dt_s);
         self.entries.clear();
         // All that concerns a zone at one go, while its vehicles are in the cache. Motions start from the
         // step's beginning, so it does not matter which zone has moved on already.
         for zone in 0..self.zones.len() {
-            self.follow_left(zone);
             account_margins(&scenario, zone, &mut self.zones[zone], &mut self.metrics[zone], dt_s);
             self.leave_zone(&scenario, zone, now_s, dt_s);
             self.settle(zone, dt_s);
@@ -37,33 +36,6 @@ impl World {
         }
         self.admit(&scenario, now_s, dt_s);
         self.enter();
-    }
-
-    /// Lets vehicles on links choose, front first, so that each sees what its leader will do.
-    fn drive_links(&mut self, scenario: &Scenario, dt_s: f64) {
-        for zone in 0..self.links.len() {
-            if self.links[zone].cars.is_empty() {
-                continue;
-            }
-            let Exit::Zone { zone: down, path, link_m } = scenario.network.zones[zone].exit else { continue };
-            let last = self.zones[down as usize].cars.iter().rev().find(|c| c.path == path);
-            let mut leader = last.map(|c| Held::new(c.held.x0_m + link_m, c.held.v0_mps, c.held.u_mps2));
-            for car in &mut self.links[zone].cars {
-                let k = scenario.control.k_rear_end_per_s;
-                let u = link::drive(car, leader.as_ref(), &scenario.vehicle, k, dt_s);
-                car.held = Held::new(car.x_m, car.v_mps, u);
-                self.held_u_mps2[car.vehicle as usize] = u;
-                leader = Some(car.held);
-            }
-        }
-    }
-
-    /// Moves a zone's index 0 with the vehicle it stands for.
-    fn follow_left(&mut self, zone: usize) {
-        if let Some(left) = &mut self.zones[zone].left {
-            let u = self.held_u_mps2[left.car.vehicle as usize];
-            left.car.held = Held::new(left.car.x_m, left.car.v_mps, u);
-        }
     }
 
     /// Takes out the vehicles that pass the conflict point during the step and sends them on.

@@ -1,6 +1,7 @@
 //! What a run is judged by, per zone and in all.
 
 use super::car::Visit;
+use crate::scenario::ShieldMode;
 use serde::{Deserialize, Serialize};
 
 /// Running sums of one zone.
@@ -167,4 +168,48 @@ pub struct WorldSummary {
     pub waiting: u32,
     /// Per zone.
     pub zones: Vec<ZoneSummaryRow>,
+    /// What the gateway did.
+    pub shield: ShieldSummary,
+}
+
+/// What the actuation gateway did with the commands of each controller.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ShieldSummary {
+    /// Off, observing, or on.
+    pub mode: ShieldMode,
+    /// Per controller process.
+    pub controllers: Vec<ShieldRow>,
+}
+
+/// Interventions in one controller's commands; in `observe` mode, those that were called for.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ShieldRow {
+    /// Controller name.
+    pub controller: String,
+    /// Commands looked at.
+    pub commands: u64,
+    /// Commands that were no number, replaced by `u_min`.
+    pub not_finite: u64,
+    /// Commands beyond the vehicle's limits, clamped.
+    pub limits: u64,
+    /// Commands bounded by the greatest speed.
+    pub speed: u64,
+    /// Commands bounded by the rear-end margin.
+    pub rear_end: u64,
+    /// Commands bounded by the merging margin.
+    pub merge: u64,
+    /// Times a vehicle was not safe toward a partner when it came to owe it something: not guaranteed.
+    pub began_unsafe: u32,
+    /// Vehicle-steps that ended unsafe although they were guaranteed; 0 with the shield on.
+    pub lost: u32,
+    /// Least rear-end margin of guaranteed vehicles at any instant, m.
+    pub min_rear_end_margin_m: Option<f64>,
+    /// Least merging margin of guaranteed vehicles from their crossing on, m.
+    pub min_merge_margin_m: Option<f64>,
+}
+
+impl ShieldRow {
+    pub(super) fn new(controller: String) -> ShieldRow {
+        ShieldRow { controller, ..ShieldRow::default() }
+    }
 }

@@ -2,10 +2,12 @@
 
 mod car;
 mod gate;
+mod gateway;
 mod integrate;
 mod link;
 mod metrics;
 mod role;
 
-pub use metrics::{CompletedVisit, WorldSummary, ZoneSummaryRow};
-pub use role::{CommandFault, CoordinatorMasks, World};
+pub use gateway::CommandFault;
+pub use metrics::{CompletedVisit, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
+pub use role::{CoordinatorMasks, World};

@@ -2,12 +2,12 @@
 
 use super::car::{Car, LeftCar};
 use super::gate::Gates;
+use super::gateway::Gateway;
 use super::link::Link;
 use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Exit, Scenario};
-use crate::vehicle::Held;
-use ipc_schemas::{self as frames, VehicleCommand, VehicleState};
+use ipc_schemas::{self as frames, VehicleState};
 use std::sync::Arc;
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
@@ -34,7 +34,8 @@ pub struct World {
     /// Per zone: an event in the step just ended, an event one step earlier, acts in the present step.
     marks: Vec<ZoneMarks>,
     summarised: u64,
-    commanded: u32,
+    pub(super) commanded: u32,
+    pub(super) gateway: Gateway,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -69,43 +70,6 @@ impl Traffic {
 struct CoordinatorShare {
     zones: std::ops::Range<u32>,
     neighbours: u64,
-}
-
-/// A command the world cannot take.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum CommandFault {
-    /// The command names a vehicle that is not the next one of that zone.
-    #[error("command for vehicle {vehicle} in zone {zone}, where vehicle {expected} was expected")]
-    OtherVehicle {
-        /// Vehicle named.
-        vehicle: u32,
-        /// Zone named.
-        zone: u32,
-        /// Vehicle expected at that place, or `NO_VEHICLE`.
-        expected: u32,
-    },
-    /// The zone has another number of vehicles.
-    #[error("{commands} commands for zone {zone}, which has {vehicles} vehicles")]
-    OtherCount {
-        /// Zone named.
-        zone: u32,
-        /// Commands received.
-        commands: usize,
-        /// Vehicles present.
-        vehicles: usize,
-    },
-    /// The acceleration is not a number within the vehicle's limits.
-    #[error("vehicle {vehicle}: acceleration {u_mps2} m/s^2 is not within [{min_mps2}, {max_mps2}]")]
-    OutOfLimits {
-        /// Vehicle named.
-        vehicle: u32,
-        /// Acceleration commanded.
-        u_mps2: f64,
-        /// Least allowed.
-        min_mps2: f64,
-        /// Greatest allowed.
-        max_mps2: f64,
-    },
 }
 
 impl World {
@@ -144,6 +108,7 @@ impl World {
             marks: vec![ZoneMarks::default(); zones],
             summarised: 0,
             commanded: 0,
+            gateway: Gateway::new(&scenario, scenario.controllers(1)),
             scenario,
         }
     }
@@ -288,49 +253,6 @@ impl World {
         CoordinatorMasks { acting, summarised }
     }
 
-    /// Takes one controller's commands for the present step.
-    pub fn command(&mut self, commands: &[VehicleCommand]) -> Result<(), CommandFault> {
-        let limits = self.scenario.vehicle;
-        let dt_s = self.scenario.dt_s();
-        for group in commands.chunk_by(|a, b| a.zone == b.zone) {
-            let zone = group[0].zone;
-            let Some(traffic) = self.zones.get_mut(zone as usize) else {
-                let expected = frames::NO_VEHICLE;
-                return Err(CommandFault::OtherVehicle { vehicle: group[0].vehicle, zone, expected });
-            };
-            if traffic.cars.len() != group.len() {
-                let (commands, vehicles) = (group.len(), traffic.cars.len());
-                return Err(CommandFault::OtherCount { zone, commands, vehicles });
-            }
-            for (car, command) in traffic.cars.iter_mut().zip(group) {
-                if car.vehicle != command.vehicle {
-                    let expected = car.vehicle;
-                    return Err(CommandFault::OtherVehicle { vehicle: command.vehicle, zone, expected });
-                }
-                let u = command.u_mps2;
-                // Written so that NaN is refused too.
-                if !(u >= limits.u_min_mps2 && u <= limits.u_max_mps2) {
-                    return Err(CommandFault::OutOfLimits {
-                        vehicle: command.vehicle,
-                        u_mps2: u,
-                        min_mps2: limits.u_min_mps2,
-                        max_mps2: limits.u_max_mps2,
-                    });
-                }
-                car.held = Held::new(car.x_m, car.v_mps, u);
-                self.held_u_mps2[car.vehicle as usize] = u;
-                car.planned_exit_time_s = command.planned_exit_time_s;
-                car.planned_exit_speed_mps = command.planned_exit_speed_mps;
-                if command.verdict == frames::VERDICT_FE {
-                    car.visit.fe_s += dt_s;
-                }
-                car.visit.infeasible |= command.verdict == frames::VERDICT_INFEASIBLE;
-            }
-            self.commanded += group.len() as u32;
-        }
-        Ok(())
-    }
-
     /// Integrates one step with the commands taken.
     ///
     /// # Errors
@@ -356,6 +278,7 @@ impl World {
             departed: self.departed,
             held_arrivals: self.gates.held,
             waiting: self.gates.waiting.iter().map(|w| w.len() as u32).sum(),
+            shield: self.gateway.summary(),
             zones: zones
                 .map(|((zone, metrics), traffic)| {
                     let mut metrics = metrics.clone();

@@ -23,10 +23,12 @@ pub struct GeneratedFile {
 }
 
 /// The generated files as they should be.
-pub fn files() -> [GeneratedFile; 2] {
+pub fn files() -> [GeneratedFile; 3] {
     [
         GeneratedFile { path: "include/cz_schemas.h", contents: c_header::render() },
         GeneratedFile { path: "python/cz_schemas.py", contents: python_module::render() },
+        // A copy: a Python package cannot take in files from outside its directory.
+        GeneratedFile { path: "../sdk/python/control_zones/_schemas.py", contents: python_module::render() },
     ]
 }
 

@@ -332,7 +332,7 @@ fn remove_base(directory: &Path) {
 /// different runtime directories, which do not see each other's nodes and would otherwise sweep each
 /// other's memory; the fixed length of the hash keeps a run `a` from matching the files of a run `a-b`.
 fn prefix(run: &RunName, directory: &Path) -> String {
-    let place = xxhash_rust::xxh3::xxh3_64(directory.as_os_str().as_encoded_bytes()) as u32;
+    let place = crc32fast::hash(directory.as_os_str().as_encoded_bytes());
     format!("cz_{}_{run}_{place:08x}_", rustix::process::getuid().as_raw())
 }
 

@@ -1,0 +1,88 @@
+/*
+ * Write a controller for Control Zones in C.
+ *
+ *     cz_plugin_t *plugin = cz_attach(NULL, NULL, 30.0);
+ *     int wake = plugin ? CZ_TIMEOUT : CZ_ERROR;
+ *     while (wake != CZ_END && wake != CZ_ERROR) {
+ *         wake = cz_wait(plugin, 1.0);
+ *         if (wake != CZ_STEP) continue;
+ *         size_t count;
+ *         const cz_vehicle_t *vehicles = cz_vehicles(plugin, &count);
+ *         cz_vehicle_command_t *commands = cz_commands(plugin, &count);
+ *         for (size_t i = 0; i < count; i++) commands[i].u_mps2 = 15.0 - vehicles[i].state->v_mps;
+ *         if (cz_send(plugin) != 0) wake = CZ_ERROR;
+ *     }
+ *
+ * A handle is used by one thread at a time. Pointers into frames are valid until cz_send: the frames lie in
+ * shared memory and go back to the world with it. The contract is docs/plugin-contract.md.
+ */
+#ifndef CONTROL_ZONES_PLUGIN_H
+#define CONTROL_ZONES_PLUGIN_H
+
+#include "cz_schemas.h" /* installed beside this file */
+
+#include <stddef.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/** What cz_wait returns. */
+#define CZ_TIMEOUT 0 /* nothing came in time; wait again */
+#define CZ_STEP 1    /* a step is to be answered */
+#define CZ_END 2     /* the run is over */
+#define CZ_ERROR (-1) /* see cz_last_error */
+
+/** An attachment to a run. */
+typedef struct cz_plugin cz_plugin_t;
+
+/** One vehicle to be commanded, with its partners looked up. */
+typedef struct cz_vehicle {
+    const cz_vehicle_state_t *state; /**< its record in the state frame */
+    const cz_vehicle_state_t *ahead; /**< the vehicle ahead on the same path, or NULL */
+    const cz_vehicle_state_t *merge; /**< the one of another path that passes first, or NULL */
+    double length_m;     /**< length of its approach, m */
+    double terminal_mps; /**< terminal speed to leave with, m/s; NaN when it is free */
+    double ahead_x_m;    /**< position of ahead in the vehicle's own coordinate, m, or NaN */
+    double merge_x_m;    /**< position of merge in the vehicle's own coordinate, m, or NaN */
+    double merge_at_m;   /**< distance of their conflict point on the vehicle's path, m, or NaN */
+} cz_vehicle_t;
+
+#if defined(__cplusplus)
+static_assert(sizeof(cz_vehicle_t) == 40 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
+#elif defined(__STDC_VERSION__) && __STDC_VERSION__ >= 201112L
+_Static_assert(sizeof(cz_vehicle_t) == 40 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
+#endif
+
+/** Joins a run. NULL names stand for the environment's CZ_RUN and CZ_CONTROLLER. NULL on failure. */
+cz_plugin_t *cz_attach(const char *run, const char *controller, double timeout_s);
+/** Leaves the run. NULL is allowed. */
+void cz_detach(cz_plugin_t *plugin);
+/** What went wrong last on this thread; valid until the next failure on it. */
+const char *cz_last_error(void);
+/** Waits for a step: CZ_STEP, CZ_TIMEOUT, CZ_END or CZ_ERROR. */
+int cz_wait(cz_plugin_t *plugin, double timeout_s);
+/** The run's numbers; valid until detached. */
+const cz_run_spec_t *cz_run_spec(const cz_plugin_t *plugin);
+/** All approaches; valid until detached. */
+const cz_approach_spec_t *cz_approaches(const cz_plugin_t *plugin, size_t *count);
+/** Name of an approach, ZONE.APPROACH; NULL beyond the last. Valid until detached. */
+const char *cz_approach_name(const cz_plugin_t *plugin, size_t index);
+/** Header of the state frame; valid until cz_send. */
+const cz_frame_header_t *cz_header(const cz_plugin_t *plugin);
+/** The state frame, all zones; valid until cz_send. */
+const cz_vehicle_state_t *cz_states(const cz_plugin_t *plugin, size_t *count);
+/** The vehicles to be commanded, in the order of the commands; valid until cz_send. */
+const cz_vehicle_t *cz_vehicles(const cz_plugin_t *plugin, size_t *count);
+/** The coordination in force in a zone; valid until the next cz_wait. */
+const cz_assignment_t *cz_assignments(const cz_plugin_t *plugin, uint32_t zone, size_t *count);
+/** Lends the command frame, vehicles and zones filled in, accelerations 0; valid until cz_send. */
+cz_vehicle_command_t *cz_commands(cz_plugin_t *plugin, size_t *count);
+/** Sends the command frame: 0, or CZ_ERROR. */
+int cz_send(cz_plugin_t *plugin);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif /* CONTROL_ZONES_PLUGIN_H */

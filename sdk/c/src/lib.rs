@@ -1,0 +1,326 @@
+//! The C ABI of `control-zones-plugin`; declared in `include/control_zones/plugin.h`, by hand, and held to
+//! it by the assertions below and by `tests/plugins.rs`, which compiles and runs programs against it.
+//!
+//! The only crate of the project with unsafe interfaces. Their common argument: a handle comes from
+//! `cz_attach` and is used by one thread at a time until `cz_detach`, as the header demands; whatever
+//! pointer a function returns points into the handle and lives until the next call that the header names.
+
+use control_zones_plugin::schemas::{
+    ApproachSpec, Assignment, FrameHeader, RunSpec, VehicleCommand, VehicleState,
+};
+use control_zones_plugin::{Commands, Error, Options, Session, Wake};
+use std::cell::RefCell;
+use std::ffi::{CStr, CString, c_char, c_double, c_int};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::ptr::{null, null_mut};
+use std::time::Duration;
+
+/// A step is to be answered.
+pub const CZ_STEP: c_int = 1;
+/// Nothing came in time.
+pub const CZ_TIMEOUT: c_int = 0;
+/// The run is over.
+pub const CZ_END: c_int = 2;
+/// See `cz_last_error`.
+pub const CZ_ERROR: c_int = -1;
+
+thread_local! {
+    static LAST_ERROR: RefCell<CString> = RefCell::new(CString::default());
+}
+
+/// An attachment, opaque to C.
+pub struct Plugin {
+    // Before the session it was lent from.
+    commands: Option<Commands>,
+    session: Session,
+    approaches: Vec<ApproachSpec>,
+    names: Vec<CString>,
+    vehicles: Vec<Vehicle>,
+}
+
+/// One vehicle to be commanded, with its partners looked up.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct Vehicle {
+    /// Its record in the state frame.
+    pub state: *const VehicleState,
+    /// The vehicle ahead on the same path, or null.
+    pub ahead: *const VehicleState,
+    /// The vehicle of another path that passes the conflict point first, or null.
+    pub merge: *const VehicleState,
+    /// Length of its approach, m.
+    pub length_m: f64,
+    /// Terminal speed, m/s; NaN when it is free.
+    pub terminal_mps: f64,
+    /// Position of `ahead` in the vehicle's own coordinate, m; NaN without one.
+    pub ahead_x_m: f64,
+    /// Position of `merge` in the vehicle's own coordinate, m; NaN without one.
+    pub merge_x_m: f64,
+    /// Distance of the conflict point shared with `merge` on the vehicle's path, m; NaN without one.
+    pub merge_at_m: f64,
+}
+
+const _: () = assert!(size_of::<Vehicle>() == 40 + 3 * size_of::<usize>());
+
+fn fail(message: &str) {
+    let text = CString::new(message.replace('\0', " ")).unwrap_or_default();
+    LAST_ERROR.with(|last| *last.borrow_mut() = text);
+}
+
+/// Runs `body`, turning errors and panics (which must not cross into C) into `otherwise`.
+fn guarded<T>(otherwise: T, body: impl FnOnce() -> Result<T, Error>) -> T {
+    match catch_unwind(AssertUnwindSafe(body)) {
+        Ok(Ok(value)) => value,
+        Ok(Err(error)) => {
+            fail(&error.to_string());
+            otherwise
+        }
+        Err(_) => {
+            fail("internal error: a panic; see stderr");
+            otherwise
+        }
+    }
+}
+
+/// What went wrong last on this thread, UTF-8; valid until the next failure on it.
+#[unsafe(no_mangle)]
+pub extern "C" fn cz_last_error() -> *const c_char {
+    LAST_ERROR.with(|last| last.borrow().as_ptr())
+}
+
+/// Joins a run; null names stand for the environment's `CZ_RUN` and `CZ_CONTROLLER`. Null on failure.
+///
+/// # Safety
+/// `run` and `controller` are null or null-terminated strings.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_attach(
+    run: *const c_char,
+    controller: *const c_char,
+    timeout_s: c_double,
+) -> *mut Plugin {
+    let text = |pointer: *const c_char, variable: &'static str| {
+        if pointer.is_null() {
+            return std::env::var(variable).map_err(|_| Error::NotConfigured(variable));
+        }
+        // SAFETY: not null, so by the caller's promise a null-terminated string.
+        Ok(unsafe { CStr::from_ptr(pointer) }.to_string_lossy().into_owned())
+    };
+    guarded(null_mut(), || {
+        let options = Options {
+            run: text(run, "CZ_RUN")?,
+            controller: text(controller, "CZ_CONTROLLER")?,
+            attach_timeout: duration(timeout_s),
+            schema_hash: control_zones_plugin::schemas::schema_hash(),
+        };
+        let session = Session::attach(&options)?;
+        let approaches = session.run().approaches.iter().map(|a| a.spec).collect();
+        let names = session.run().approaches.iter();
+        let names = names.map(|a| CString::new(a.name.as_str()).unwrap_or_default()).collect();
+        let plugin = Plugin { commands: None, session, approaches, names, vehicles: Vec::new() };
+        Ok(Box::into_raw(Box::new(plugin)))
+    })
+}
+
+fn duration(seconds: f64) -> Duration {
+    Duration::try_from_secs_f64(seconds.clamp(0.0, 1e6)).unwrap_or_default()
+}
+
+/// Leaves the run. Null is allowed.
+///
+/// # Safety
+/// `plugin` is null or from `cz_attach`, and is not used again.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_detach(plugin: *mut Plugin) {
+    if !plugin.is_null() {
+        // SAFETY: by the caller's promise it came out of `Box::into_raw` and this is its last use.
+        let plugin = unsafe { Box::from_raw(plugin) };
+        guarded((), || {
+            drop(plugin);
+            Ok(())
+        });
+    }
+}
+
+/// Waits up to `timeout_s` for a step: `CZ_STEP`, `CZ_TIMEOUT`, `CZ_END` or `CZ_ERROR`.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_wait(plugin: *mut Plugin, timeout_s: c_double) -> c_int {
+    // SAFETY: a live handle, used by one thread at a time.
+    let plugin = unsafe { &mut *plugin };
+    guarded(CZ_ERROR, || {
+        Ok(match plugin.session.wait(duration(timeout_s))? {
+            Wake::Timeout => CZ_TIMEOUT,
+            Wake::End => CZ_END,
+            Wake::Step => {
+                plugin.look_up();
+                CZ_STEP
+            }
+        })
+    })
+}
+
+impl Plugin {
+    fn look_up(&mut self) {
+        self.vehicles.clear();
+        for vehicle in self.session.step().vehicles() {
+            let mut found = Vehicle {
+                state: vehicle.state,
+                ahead: null(),
+                merge: null(),
+                length_m: vehicle.length_m,
+                terminal_mps: vehicle.terminal_mps().unwrap_or(f64::NAN),
+                ahead_x_m: f64::NAN,
+                merge_x_m: f64::NAN,
+                merge_at_m: f64::NAN,
+            };
+            for partner in vehicle.partners() {
+                if partner.merges {
+                    found.merge = partner.state;
+                    found.merge_x_m = partner.x_m;
+                    found.merge_at_m = partner.conflict_m;
+                } else {
+                    found.ahead = partner.state;
+                    found.ahead_x_m = partner.x_m;
+                }
+            }
+            self.vehicles.push(found);
+        }
+    }
+}
+
+/// The run's numbers; valid until detached.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_run_spec(plugin: *const Plugin) -> *const RunSpec {
+    // SAFETY: a live handle.
+    unsafe { &(*plugin).session.run().spec }
+}
+
+/// All approaches; valid until detached.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`; `count` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_approaches(plugin: *const Plugin, count: *mut usize) -> *const ApproachSpec {
+    // SAFETY: a live handle, and a place to write to.
+    unsafe {
+        let approaches = &(*plugin).approaches;
+        *count = approaches.len();
+        approaches.as_ptr()
+    }
+}
+
+/// The name of an approach, `ZONE.APPROACH`; null beyond the last one.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_approach_name(plugin: *const Plugin, index: usize) -> *const c_char {
+    // SAFETY: a live handle.
+    let names = unsafe { &(*plugin).names };
+    names.get(index).map_or(null(), |name| name.as_ptr())
+}
+
+/// The header of the state frame; valid until `cz_send`. Null without a step.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`, and `cz_wait` has returned `CZ_STEP`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_header(plugin: *const Plugin) -> *const FrameHeader {
+    // SAFETY: a live handle.
+    let session = unsafe { &(*plugin).session };
+    guarded(null(), || Ok(std::ptr::from_ref(session.step().header)))
+}
+
+/// The state frame, where it lies in shared memory; valid until `cz_send`. Null without a step.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`, `cz_wait` has returned `CZ_STEP`; `count` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_states(plugin: *const Plugin, count: *mut usize) -> *const VehicleState {
+    // SAFETY: a live handle, and a place to write to.
+    let (session, count) = unsafe { (&(*plugin).session, &mut *count) };
+    *count = 0;
+    guarded(null(), || {
+        let states = session.step().states;
+        *count = states.len();
+        Ok(states.as_ptr())
+    })
+}
+
+/// The vehicles to be commanded, in the order of the commands; valid until `cz_send`.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`; `count` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_vehicles(plugin: *const Plugin, count: *mut usize) -> *const Vehicle {
+    // SAFETY: a live handle, and a place to write to.
+    unsafe {
+        let vehicles = &(*plugin).vehicles;
+        *count = vehicles.len();
+        vehicles.as_ptr()
+    }
+}
+
+/// The coordination in force in a zone; valid until the next `cz_wait`.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`, `cz_wait` has returned `CZ_STEP`; `count` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_assignments(
+    plugin: *const Plugin,
+    zone: u32,
+    count: *mut usize,
+) -> *const Assignment {
+    // SAFETY: a live handle, and a place to write to.
+    let (session, count) = unsafe { (&(*plugin).session, &mut *count) };
+    *count = 0;
+    guarded(null(), || {
+        let assignments = session.assignments(zone);
+        *count = assignments.len();
+        Ok(assignments.as_ptr())
+    })
+}
+
+/// Lends the command frame of this step, vehicles and zones filled in, accelerations 0; valid until
+/// `cz_send`. Called again before that, it returns the same frame. Null on failure.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`; `count` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_commands(plugin: *mut Plugin, count: *mut usize) -> *mut VehicleCommand {
+    // SAFETY: a live handle used by one thread, and a place to write to.
+    let (plugin, count) = unsafe { (&mut *plugin, &mut *count) };
+    *count = 0;
+    guarded(null_mut(), || {
+        if plugin.commands.is_none() {
+            plugin.commands = Some(plugin.session.take_commands()?);
+        }
+        let records = plugin.commands.as_mut().map(Commands::records_mut).unwrap_or_default();
+        *count = records.len();
+        Ok(records.as_mut_ptr())
+    })
+}
+
+/// Sends the command frame: 0, or `CZ_ERROR`.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_send(plugin: *mut Plugin) -> c_int {
+    // SAFETY: a live handle, used by one thread at a time.
+    let plugin = unsafe { &mut *plugin };
+    guarded(CZ_ERROR, || {
+        let commands = match plugin.commands.take() {
+            Some(commands) => commands,
+            None => plugin.session.take_commands()?,
+        };
+        plugin.vehicles.clear();
+        plugin.session.send(commands)?;
+        Ok(0)
+    })
+}

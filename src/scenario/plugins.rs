@@ -1,0 +1,118 @@
+//! Which controller drives which approaches, and what the gateway does with its commands.
+
+use super::{Scenario, ZoneId};
+use serde::{Deserialize, Serialize};
+
+/// A controller written elsewhere, which joins the run as a process of its own.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Plugin {
+    /// Unique name; the process gives it when it attaches.
+    pub name: String,
+    /// The approaches it drives: zone and path, ascending.
+    pub approaches: Vec<(ZoneId, u32)>,
+    /// Command line with which `cz run` starts it; absent when somebody else does.
+    pub command: Option<String>,
+}
+
+impl Plugin {
+    /// FNV-1a of the name: what a plug-in puts into its attach request. Chosen because it takes three
+    /// lines in any language.
+    pub fn name_hash(&self) -> u64 {
+        ipc_schemas::name_hash(&self.name)
+    }
+}
+
+/// What the actuation gateway does with commands that are not safe.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ShieldMode {
+    /// They are applied.
+    #[default]
+    Off,
+    /// They are applied, and counted.
+    Observe,
+    /// They are replaced by the nearest safe ones, and counted.
+    On,
+}
+
+impl ShieldMode {
+    /// The word for it in scenarios and summaries.
+    pub fn name(self) -> &'static str {
+        match self {
+            ShieldMode::Off => "off",
+            ShieldMode::Observe => "observe",
+            ShieldMode::On => "on",
+        }
+    }
+}
+
+/// Which controller process drives which approach: the built-in pool's processes come first, then the
+/// plug-ins in order of declaration.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Drivers {
+    pool: u32,
+    plugins: u32,
+    /// Controller index by zone and path.
+    of: Vec<Vec<u32>>,
+}
+
+impl Drivers {
+    /// The drivers of a run with so many controller processes in all.
+    ///
+    /// # Panics
+    /// When these are fewer than the plug-ins.
+    pub fn new(scenario: &Scenario, controllers: u32) -> Drivers {
+        let plugins = scenario.plugins.len() as u32;
+        let pool = controllers.checked_sub(plugins).expect("every plug-in is a controller process");
+        let zones = scenario.network.zones.len() as u32;
+        let mut of: Vec<Vec<u32>> =
+            scenario.network.zones.iter().map(|z| vec![u32::MAX; z.approaches.len()]).collect();
+        for index in 0..pool {
+            for zone in super::share::zones_of(zones, index, pool) {
+                of[zone as usize].fill(index);
+            }
+        }
+        for (plugin, index) in scenario.plugins.iter().zip(pool..) {
+            for &(zone, path) in &plugin.approaches {
+                of[zone as usize][path as usize] = index;
+            }
+        }
+        Drivers { pool, plugins, of }
+    }
+
+    /// The controller that drives an approach.
+    pub fn of(&self, zone: ZoneId, path: u32) -> u32 {
+        self.of[zone as usize][path as usize]
+    }
+
+    /// Number of processes of the built-in pool.
+    pub fn pool(&self) -> u32 {
+        self.pool
+    }
+
+    /// Number of controller processes in all.
+    pub fn count(&self) -> u32 {
+        self.pool + self.plugins
+    }
+}
+
+impl Scenario {
+    /// Whether an approach is driven by a plug-in.
+    pub fn is_plugged(&self, zone: ZoneId, path: u32) -> bool {
+        self.plugins.iter().any(|p| p.approaches.contains(&(zone, path)))
+    }
+
+    /// Number of controller processes of a run whose built-in pool may have `pool` of them: none when
+    /// plug-ins drive every approach.
+    pub fn controllers(&self, pool: u32) -> u32 {
+        let approaches: usize = self.network.zones.iter().map(|z| z.approaches.len()).sum();
+        let plugged: usize = self.plugins.iter().map(|p| p.approaches.len()).sum();
+        let pool = if plugged == approaches { 0 } else { pool };
+        pool + self.plugins.len() as u32
+    }
+
+    /// The same scenario with the built-in law in place of every plug-in.
+    pub fn without_plugins(&self) -> Scenario {
+        Scenario { plugins: Vec::new(), ..self.clone() }
+    }
+}

@@ -1,0 +1,374 @@
+//! The actuation gateway: every command passes here on its way to a vehicle.
+//!
+//! A frame is validated as it comes (known vehicles, the sender's own, each once, in order; finite, within
+//! limits). Once all have come, the shield looks at them front first: zones downstream before zones
+//! upstream, within a zone in passing order. So the motion of every partner is settled before the vehicles
+//! that depend on it, and the result does not depend on the order in which frames came.
+
+use super::car::{Car, Guard};
+use super::metrics::{ShieldRow, ShieldSummary};
+use super::role::World;
+use crate::scenario::{Drivers, Exit, Scenario, ShieldMode};
+use crate::shield::{Duty, Partner, RESERVE_M, Row, Shield};
+use crate::vehicle::Held;
+use ipc_schemas::{self as frames, VehicleCommand};
+
+/// A command frame the world cannot take.
+#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+pub enum CommandFault {
+    /// The vehicle is not a member of any zone: it never existed, is on a link, or has left.
+    #[error("record {record}, field vehicle: vehicle {vehicle} is in no zone")]
+    UnknownVehicle {
+        /// Place in the frame.
+        record: usize,
+        /// Vehicle named.
+        vehicle: u32,
+    },
+    /// Another controller drives the vehicle.
+    #[error("record {record}, field vehicle: vehicle {vehicle} is driven by controller {driver}")]
+    ForeignVehicle {
+        /// Place in the frame.
+        record: usize,
+        /// Vehicle named.
+        vehicle: u32,
+        /// Index of the controller that drives it.
+        driver: u32,
+    },
+    /// The frame commands the vehicle twice.
+    #[error("record {record}, field vehicle: vehicle {vehicle} is commanded twice")]
+    Duplicate {
+        /// Place in the frame of the second.
+        record: usize,
+        /// Vehicle named.
+        vehicle: u32,
+    },
+    /// A vehicle of the sender has no command where it should have one.
+    #[error("record {record}, field vehicle: vehicle {vehicle} of zone {zone} has no command there")]
+    MissingVehicle {
+        /// Place in the frame at which it was expected.
+        record: usize,
+        /// The vehicle.
+        vehicle: u32,
+        /// Its zone.
+        zone: u32,
+    },
+    /// The record names a zone the vehicle is not in.
+    #[error("record {record}, field zone: vehicle {vehicle} is in zone {expected}, not {zone}")]
+    OtherZone {
+        /// Place in the frame.
+        record: usize,
+        /// The vehicle.
+        vehicle: u32,
+        /// Zone named.
+        zone: u32,
+        /// Zone the vehicle is in.
+        expected: u32,
+    },
+    /// The acceleration is not a number.
+    #[error("record {record}, field u_mps2: vehicle {vehicle} is commanded {u_mps2}")]
+    NotFinite {
+        /// Place in the frame.
+        record: usize,
+        /// The vehicle.
+        vehicle: u32,
+        /// Acceleration commanded.
+        u_mps2: f64,
+    },
+    /// The acceleration is not within the vehicle's limits.
+    #[error(
+        "record {record}, field u_mps2: vehicle {vehicle} is commanded {u_mps2} m/s^2, which is not within \
+         [{min_mps2}, {max_mps2}]"
+    )]
+    OutOfLimits {
+        /// Place in the frame.
+        record: usize,
+        /// The vehicle.
+        vehicle: u32,
+        /// Acceleration commanded.
+        u_mps2: f64,
+        /// Least allowed.
+        min_mps2: f64,
+        /// Greatest allowed.
+        max_mps2: f64,
+    },
+    /// The planned exit, which other vehicles may read, is not a number.
+    #[error("record {record}, field planned_exit_time_s or planned_exit_speed_mps: not finite")]
+    BadIntent {
+        /// Place in the frame.
+        record: usize,
+    },
+}
+
+/// A vehicle that leaves the network more slowly speeds up to this outside, m/s.
+const LEAST_EXIT_MPS: f64 = 5.0;
+/// How it does, m/s^2.
+const EXIT_MPS2: f64 = 2.0;
+
+/// The gateway's configuration and what it has counted.
+#[derive(Debug)]
+pub(super) struct Gateway {
+    mode: ShieldMode,
+    shield: Shield,
+    drivers: Drivers,
+    rows: Vec<ShieldRow>,
+    /// Motion over the step of each zone's members, in passing order; kept for its allocation.
+    partners: Vec<Partner>,
+}
+
+impl Gateway {
+    pub(super) fn new(scenario: &Scenario, controllers: u32) -> Gateway {
+        let drivers = Drivers::new(scenario, controllers);
+        let names = (0..drivers.pool())
+            .map(|i| if drivers.pool() == 1 { "built-in".to_owned() } else { format!("built-in {i}") })
+            .chain(scenario.plugins.iter().map(|p| p.name.clone()));
+        Gateway {
+            mode: scenario.shield,
+            shield: Shield::new(&scenario.vehicle, scenario.dt_s()),
+            rows: names.map(ShieldRow::new).collect(),
+            drivers,
+            partners: Vec::with_capacity(2),
+        }
+    }
+
+    pub(super) fn summary(&self) -> ShieldSummary {
+        ShieldSummary { mode: self.mode, controllers: self.rows.clone() }
+    }
+}
+
+impl World {
+    /// Shares the approaches out over the built-in pool and the plug-ins, `controllers` processes in all.
+    /// Without it, one process drives everything that no plug-in drives.
+    pub fn share_out(&mut self, controllers: u32) {
+        self.gateway = Gateway::new(&self.scenario, controllers);
+    }
+
+    /// Which controller drives what.
+    pub fn drivers(&self) -> &Drivers {
+        &self.gateway.drivers
+    }
+
+    /// Takes one controller's commands for the present step.
+    ///
+    /// With the shield on, an acceleration that is no number becomes `u_min` and one beyond the limits the
+    /// limit, and both are counted; otherwise they are faults.
+    ///
+    /// # Errors
+    /// What is wrong with the first bad record. Part of the frame has then been taken.
+    pub fn command(&mut self, sender: u32, commands: &[VehicleCommand]) -> Result<(), CommandFault> {
+        let limits = self.scenario.vehicle;
+        let dt_s = self.scenario.dt_s();
+        let Gateway { mode, drivers, rows, .. } = &mut self.gateway;
+        let mut next = 0;
+        let mut fault = None;
+        'zones: for (zone, traffic) in (0..).zip(&mut self.zones) {
+            for car in traffic.cars.iter_mut().filter(|c| drivers.of(zone, c.path) == sender) {
+                let record = next;
+                let Some(command) = commands.get(record).filter(|c| c.vehicle == car.vehicle) else {
+                    fault = Some((record, car.vehicle, zone));
+                    break 'zones;
+                };
+                let vehicle = command.vehicle;
+                if command.zone != zone {
+                    return Err(CommandFault::OtherZone {
+                        record,
+                        vehicle,
+                        zone: command.zone,
+                        expected: zone,
+                    });
+                }
+                if !(command.planned_exit_time_s.is_finite() && command.planned_exit_speed_mps.is_finite()) {
+                    return Err(CommandFault::BadIntent { record });
+                }
+                let mut u = command.u_mps2;
+                let (min_mps2, max_mps2) = (limits.u_min_mps2, limits.u_max_mps2);
+                // Written so that NaN is no exception.
+                if !(u >= min_mps2 && u <= max_mps2) {
+                    let row = &mut rows[sender as usize];
+                    match *mode {
+                        ShieldMode::On if u.is_finite() => {
+                            row.limits += 1;
+                            u = u.clamp(min_mps2, max_mps2);
+                        }
+                        ShieldMode::On => {
+                            row.not_finite += 1;
+                            u = min_mps2;
+                        }
+                        _ if u.is_finite() => {
+                            let u_mps2 = u;
+                            let fault =
+                                CommandFault::OutOfLimits { record, vehicle, u_mps2, min_mps2, max_mps2 };
+                            return Err(fault);
+                        }
+                        _ => return Err(CommandFault::NotFinite { record, vehicle, u_mps2: u }),
+                    }
+                }
+                car.command_mps2 = u;
+                car.held = Held::new(car.x_m, car.v_mps, u);
+                self.held_u_mps2[vehicle as usize] = u;
+                car.planned_exit_time_s = command.planned_exit_time_s;
+                car.planned_exit_speed_mps = command.planned_exit_speed_mps;
+                if command.verdict == frames::VERDICT_FE {
+                    car.visit.fe_s += dt_s;
+                }
+                car.visit.infeasible |= command.verdict == frames::VERDICT_INFEASIBLE;
+                next += 1;
+            }
+        }
+        self.commanded += next as u32;
+        match fault {
+            Some((record, vehicle, zone)) => {
+                Err(self.mismatch(sender, commands, record, Some((vehicle, zone))))
+            }
+            None if next < commands.len() => Err(self.mismatch(sender, commands, next, None)),
+            None => Ok(()),
+        }
+    }
+
+    /// Forgets the commands taken for this step, so that all can be given again.
+    pub fn forget_commands(&mut self) {
+        self.commanded = 0;
+    }
+
+    /// What is wrong with a frame whose record is not the one expected there (vehicle and zone; `None` at
+    /// the end of the frame).
+    fn mismatch(
+        &self,
+        sender: u32,
+        commands: &[VehicleCommand],
+        record: usize,
+        expected: Option<(u32, u32)>,
+    ) -> CommandFault {
+        let missing = |(vehicle, zone)| CommandFault::MissingVehicle { record, vehicle, zone };
+        let (Some(found), expected) = (commands.get(record), expected) else {
+            return missing(
+                expected.expect("a frame longer or shorter than asked for has a record at fault"),
+            );
+        };
+        let vehicle = found.vehicle;
+        if commands[..record].iter().any(|c| c.vehicle == vehicle) {
+            return CommandFault::Duplicate { record, vehicle };
+        }
+        let mut driver = None;
+        for (zone, traffic) in (0..).zip(&self.zones) {
+            if let Some(car) = traffic.cars.iter().find(|c| c.vehicle == vehicle) {
+                driver = Some(self.gateway.drivers.of(zone, car.path));
+            }
+        }
+        match (driver, expected) {
+            (None, _) => CommandFault::UnknownVehicle { record, vehicle },
+            (Some(driver), _) if driver != sender => CommandFault::ForeignVehicle { record, vehicle, driver },
+            (Some(_), Some(expected)) => missing(expected),
+            (Some(_), None) => CommandFault::Duplicate { record, vehicle },
+        }
+    }
+
+    /// Settles what every vehicle holds over the step: zones downstream first, and within a zone in passing
+    /// order, so that whoever a vehicle depends on has been settled before.
+    pub(super) fn hold_all(&mut self, scenario: &Scenario, dt_s: f64) {
+        for zone in (0..self.zones.len()).rev() {
+            self.drive_link(scenario, zone, dt_s);
+            // Index 0 moves with the vehicle it stands for.
+            if let Some(left) = &mut self.zones[zone].left {
+                let mut u = self.held_u_mps2[left.car.vehicle as usize];
+                // Out of the network nobody drives it. Whoever left it creeping must not creep for ever:
+                // those behind would have to leave more slowly each, down to a standstill.
+                if scenario.network.zones[zone].exit == Exit::Out && left.car.v_mps < LEAST_EXIT_MPS {
+                    u = EXIT_MPS2.min(scenario.vehicle.u_max_mps2);
+                }
+                left.car.held = Held::new(left.car.x_m, left.car.v_mps, u);
+            }
+            if self.gateway.mode != ShieldMode::Off {
+                self.shield_zone(scenario, zone);
+                for car in &self.zones[zone].cars {
+                    self.held_u_mps2[car.vehicle as usize] = car.command_mps2;
+                }
+            }
+        }
+    }
+
+    /// Projects the commands of a zone's members, in passing order.
+    fn shield_zone(&mut self, scenario: &Scenario, index: usize) {
+        let zone = &scenario.network.zones[index];
+        let length_m = |car: &Car| zone.approaches[car.path as usize].length_m;
+        let Gateway { mode, shield, drivers, rows, partners } = &mut self.gateway;
+        let traffic = &mut self.zones[index];
+        let left = traffic.left.as_ref().map(|l| &l.car);
+        for i in 0..traffic.cars.len() {
+            let (before, rest) = traffic.cars.split_at_mut(i);
+            let car = &mut rest[0];
+            // The partners of `coordination::partners`, from the same order.
+            let ahead =
+                before.iter().rev().find(|c| c.path == car.path).or(left.filter(|c| c.path == car.path));
+            let previous = before.last().or(left).filter(|c| c.path != car.path);
+            let own_length_m = length_m(car);
+            let merge = Duty::Merge { conflict_m: own_length_m };
+            partners.clear();
+            for (duty, other) in [(Duty::RearEnd, ahead), (merge, previous)] {
+                let Some(other) = other else { continue };
+                let shift_m = own_length_m - length_m(other);
+                let Held { x0_m, v0_mps, u_mps2, .. } = other.held;
+                let partner = Partner { duty, motion: Held::new(x0_m + shift_m, v0_mps, u_mps2) };
+                let guard =
+                    if duty == Duty::RearEnd { &mut car.visit.rear_end } else { &mut car.visit.merge };
+                let row = &mut rows[drivers.of(index as u32, car.path) as usize];
+                // Judged when the vehicle comes to owe this partner something, and held to it from then on.
+                if guard.partner != Some(other.vehicle) {
+                    let safe = shield.state_slack_m(car.x_m, car.v_mps, &partner) >= RESERVE_M;
+                    *guard = Guard { partner: Some(other.vehicle), safe };
+                    row.began_unsafe += u32::from(!safe);
+                }
+                partners.push(partner);
+            }
+            let row = &mut rows[drivers.of(index as u32, car.path) as usize];
+            row.commands += 1;
+            let found = shield.project(car.x_m, car.v_mps, car.command_mps2, partners.iter().copied());
+            match found.row {
+                None => {}
+                Some(Row::Speed) => row.speed += 1,
+                Some(Row::RearEnd) => row.rear_end += 1,
+                Some(Row::Merge) => row.merge += 1,
+            }
+            if *mode == ShieldMode::On {
+                car.command_mps2 = found.u_mps2;
+            }
+            let held = Held::new(car.x_m, car.v_mps, car.command_mps2);
+            car.held = held;
+            for partner in partners.iter() {
+                let (guard, least) = if partner.duty == Duty::RearEnd {
+                    (car.visit.rear_end, &mut row.min_rear_end_margin_m)
+                } else {
+                    (car.visit.merge, &mut row.min_merge_margin_m)
+                };
+                if guard.safe {
+                    let margin = shield.least_margin_m(&held, partner);
+                    if margin < least.unwrap_or(f64::INFINITY) {
+                        *least = Some(margin);
+                    }
+                    row.lost += u32::from(shield.slack_after_m(&held, partner) < 0.0);
+                }
+            }
+        }
+    }
+
+    /// Lets the vehicles on the link behind a zone choose, front first, so that each sees what its leader
+    /// will do.
+    fn drive_link(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) {
+        if self.links[zone].cars.is_empty() {
+            return;
+        }
+        let Exit::Zone { zone: down, path, link_m } = scenario.network.zones[zone].exit else { return };
+        let last = self.zones[down as usize].cars.iter().rev().find(|c| c.path == path);
+        let mut leader = last.map(|c| Held::new(c.held.x0_m + link_m, c.held.v0_mps, c.held.u_mps2));
+        for car in &mut self.links[zone].cars {
+            let k = scenario.control.k_rear_end_per_s;
+            let mut u = super::link::drive(car, leader.as_ref(), &scenario.vehicle, k, dt_s);
+            if self.gateway.mode == ShieldMode::On {
+                let partner = leader.map(|motion| Partner { duty: Duty::RearEnd, motion });
+                u = self.gateway.shield.project(car.x_m, car.v_mps, u, partner.into_iter()).u_mps2;
+            }
+            car.held = Held::new(car.x_m, car.v_mps, u);
+            self.held_u_mps2[car.vehicle as usize] = u;
+            leader = Some(car.held);
+        }
+    }
+}

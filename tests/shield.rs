@@ -1,0 +1,187 @@
+//! The shield against adversaries, in the world itself: a million vehicle-steps each.
+
+#![allow(clippy::unwrap_used)] // a test
+
+use control_zones::lockstep::in_process::InProcess;
+use control_zones::scenario::{Override, Scenario, load};
+use control_zones::world::{ShieldRow, World};
+use ipc_schemas::{STATE_LEFT, VehicleCommand, VehicleState};
+use std::sync::Arc;
+
+const VEHICLE_STEPS: u64 = 1_000_000;
+
+/// Random arrivals, three roads, eight zones' worth of traffic at most; enough for many pairs.
+fn scenario(name: &str, shield: &str, min_headway_s: f64, rate: f64, seed: u64) -> Arc<Scenario> {
+    let mut sets = vec![
+        format!("shield={shield}"),
+        "end.time_s=40000".to_owned(),
+        "end.vehicles=4000000000".to_owned(),
+        "vehicle.standstill_gap_m=1".to_owned(),
+    ];
+    let base = load(Some(name), &[], None).unwrap();
+    for road in &base.network.roads {
+        sets.push(format!(
+            "roads.{}.demand={{rates=[{{until_s=40000.0, vehicles_per_hour={rate}}}], \
+             min_headway_s={min_headway_s}, speed_mean_mps=16.0, speed_sd_mps=1.0, speed_min_mps=14.0, \
+             speed_max_mps=18.0}}",
+            road.name
+        ));
+    }
+    let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
+    Arc::new(load(Some(name), &sets, Some(seed)).unwrap())
+}
+
+/// A small generator of its own, so that the adversaries do not depend on anybody's version.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> f64 {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        (self.0 >> 11) as f64 / (1u64 << 53) as f64
+    }
+}
+
+/// Drives the world with an adversary until so many vehicle-steps have been commanded.
+fn attack(
+    scenario: &Arc<Scenario>,
+    steps: u64,
+    mut adversary: impl FnMut(u64, &VehicleState) -> f64,
+) -> (ShieldRow, u64, World) {
+    let mut world = World::new(scenario.clone(), 1);
+    let mut commanded = 0;
+    while commanded < steps && !world.is_finished() {
+        let step = world.step();
+        let commands: Vec<VehicleCommand> = world
+            .records()
+            .filter(|s| s.zone != ipc_schemas::NO_ZONE && s.flags & STATE_LEFT == 0)
+            .map(|s| VehicleCommand {
+                u_mps2: adversary(step, &s),
+                vehicle: s.vehicle,
+                zone: s.zone,
+                ..VehicleCommand::default()
+            })
+            .collect();
+        commanded += commands.len() as u64;
+        world.command(0, &commands).unwrap();
+        world.advance().unwrap();
+    }
+    let row = world.summary().shield.controllers[0].clone();
+    (row, commanded, world)
+}
+
+fn always_u_max() -> impl FnMut(u64, &VehicleState) -> f64 {
+    |_, _| 4.0
+}
+
+fn random_flips() -> impl FnMut(u64, &VehicleState) -> f64 {
+    let mut random = Random(0x9e37_79b9_7f4a_7c15);
+    move |_, _| if random.next() < 0.45 { -4.0 } else { 4.0 }
+}
+
+/// Every so often a vehicle brakes to a stop and stands for a while; all others push. Those about to leave
+/// the network go on: there the world lets a vehicle keep its speed, and a standing one would stay.
+fn leaders_that_stop() -> impl FnMut(u64, &VehicleState) -> f64 {
+    let mut random = Random(0x1234_5678_9abc_def1);
+    let mut until = std::collections::HashMap::new();
+    move |step, s| {
+        if random.next() < 0.004 {
+            until.insert(s.vehicle, step + 120);
+        }
+        let stops = until.get(&s.vehicle).is_some_and(|&u| step < u) && s.x_m < 150.0;
+        if stops { -4.0 } else { 4.0 }
+    }
+}
+
+fn assert_holds(row: &ShieldRow, commanded: u64) {
+    assert!(commanded >= VEHICLE_STEPS, "only {commanded} vehicle-steps");
+    assert_eq!(row.lost, 0);
+    let (rear_end, merge) = (row.min_rear_end_margin_m.unwrap(), row.min_merge_margin_m.unwrap());
+    println!(
+        "{commanded} vehicle-steps; bounded: rear end {}, merge {}, speed {}; least margins {rear_end:.3e} / \
+         {merge:.3e} m; {} pairs began unsafe",
+        row.rear_end, row.merge, row.speed, row.began_unsafe
+    );
+    assert!(rear_end >= 0.0, "{rear_end}");
+    assert!(merge >= 0.0, "{merge}");
+    assert!(row.rear_end > 0 && row.merge > 0);
+}
+
+/// The three adversaries, shield on and off, over arrivals of which some enter unsafe.
+fn withstands<A: FnMut(u64, &VehicleState) -> f64>(network: &str, adversary: impl Fn() -> A) {
+    let (row, commanded, _) = attack(&scenario(network, "on", 2.2, 500.0, 1), VEHICLE_STEPS, adversary());
+    assert_holds(&row, commanded);
+    // Observing changes nothing, so the same commands do harm.
+    let (row, _, _) = attack(&scenario(network, "observe", 2.2, 500.0, 1), 100_000, adversary());
+    println!("unshielded: least margins {:?} / {:?} m", row.min_rear_end_margin_m, row.min_merge_margin_m);
+    assert!(row.lost > 0);
+    assert!(row.min_rear_end_margin_m.unwrap() < 0.0);
+    assert!(row.min_merge_margin_m.unwrap() < 0.0);
+}
+
+#[test]
+fn withstands_full_acceleration() {
+    withstands("two-merges", always_u_max);
+}
+
+#[test]
+fn withstands_random_flips() {
+    withstands("two-merges", random_flips);
+}
+
+#[test]
+fn withstands_leaders_that_stop() {
+    withstands("two-merges", leaders_that_stop);
+}
+
+#[test]
+fn withstands_them_in_a_tree_and_a_corridor() {
+    for network in ["tree", "corridor-8"] {
+        withstands(network, always_u_max);
+        withstands(network, leaders_that_stop);
+    }
+}
+
+/// A run of the built-in law, in one process.
+fn built_in(scenario: &Arc<Scenario>) -> control_zones::world::WorldSummary {
+    let mut run = InProcess::new(scenario, 1, 1);
+    run.run().unwrap();
+    run.world().summary()
+}
+
+#[test]
+fn changes_nothing_when_nothing_is_violated() {
+    let mut quiet = 0;
+    for seed in 1..=20 {
+        let with = |shield: &str| {
+            let base = scenario("two-merges", shield, 4.0, 120.0, seed);
+            built_in(&Arc::new(Scenario { max_vehicles: Some(60), ..(*base).clone() }))
+        };
+        let (off, observed) = (with("off"), with("observe"));
+        assert_eq!(observed.state_hash, off.state_hash, "observing changes nothing, ever");
+        let row = &observed.shield.controllers[0];
+        assert!(row.commands > 5_000);
+        if (row.rear_end, row.merge, row.speed, row.began_unsafe) == (0, 0, 0, 0) {
+            quiet += 1;
+            assert_eq!(with("on").state_hash, off.state_hash);
+        }
+    }
+    assert!(quiet >= 5, "only {quiet} runs without a violation");
+}
+
+#[test]
+fn values_beyond_the_limits_are_bounded_only_with_the_shield_on() {
+    let wild = |step: u64, _: &VehicleState| if step.is_multiple_of(2) { f64::NAN } else { 1e9 };
+    let (row, commanded, _) = attack(&scenario("two-merges", "on", 2.2, 500.0, 1), 1000, wild);
+    assert_eq!(row.not_finite + row.limits, commanded);
+    let mut world = World::new(scenario("two-merges", "off", 2.2, 500.0, 1), 1);
+    while world.records().next().is_none() {
+        world.command(0, &[]).unwrap();
+        world.advance().unwrap();
+    }
+    let s = world.records().next().unwrap();
+    let bad = VehicleCommand { u_mps2: f64::NAN, vehicle: s.vehicle, zone: s.zone, ..Default::default() };
+    let text = world.command(0, &[bad]).unwrap_err().to_string();
+    assert_eq!(text, format!("record 0, field u_mps2: vehicle {} is commanded NaN", s.vehicle));
+}
