@@ -54,6 +54,8 @@ fn scenario() -> Scenario {
             fe_fraction: 0.25,
         },
         beta: 2.0 / 3.0,
+        plugins: Vec::new(),
+        shield: control_zones::scenario::ShieldMode::Off,
     }
 }
 

@@ -1,5 +1,5 @@
 //! The C ABI of `control-zones-plugin`; declared in `include/control_zones/plugin.h`, by hand, and held to
-//! it by the assertions below and by `tests/plugins.rs`, which compiles and runs programs against it.
+//! it by the assertions in both and by `examples/run_all.sh`, which compiles and runs programs against it.
 //!
 //! The only crate of the project with unsafe interfaces. Their common argument: a handle comes from
 //! `cz_attach` and is used by one thread at a time until `cz_detach`, as the header demands; whatever

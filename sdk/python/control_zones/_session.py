@@ -3,6 +3,7 @@
 import ctypes
 import os
 import random
+import shutil
 import time
 import zlib
 
@@ -99,6 +100,7 @@ class Session:
         config = iceoryx2.config.default()
         config.global_cfg.root_path = iceoryx2.Path.new(directory)
         config.global_cfg.prefix = iceoryx2.FileName.new(prefix)
+        self._config, self._directory, self._prefix = config, directory, prefix
         self._node = (
             iceoryx2.NodeBuilder.new()
             .config(config)
@@ -293,6 +295,27 @@ class Session:
             raise Error("the world has gone")
         self._next_step += 1
 
+    def close(self):
+        """Leaves the run. Whoever leaves last removes what iceoryx2 leaves behind."""
+        if self._node is None:
+            return
+        self._state = self._states = self._coordination = self._commands = None
+        self._replies = self._requests = self._node = None
+        if iceoryx2.Node.list(iceoryx2.ServiceType.Ipc, self._config):
+            return
+        for name in os.listdir("/dev/shm"):
+            if name.startswith(self._prefix):
+                _forget(os.remove, os.path.join("/dev/shm", name))
+        shutil.rmtree(self._directory, ignore_errors=True)
+        # Fails, as it should, while another run has its directory there.
+        _forget(os.rmdir, os.path.dirname(self._directory))
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
     def _own(self, states):
         """Per own zone: its slice of the frame, and the places of the vehicles to be commanded."""
         zones = {zone: [None, 0, []] for zone in self.run.own_zones}
@@ -309,6 +332,13 @@ class Session:
         return [(zone, (start or 0, end), own) for zone, (start, end, own) in zones.items()]
 
 
+def _forget(remove, path):
+    try:
+        remove(path)
+    except OSError:
+        pass
+
+
 def _pause(deadline, late):
     if time.monotonic() >= deadline:
         raise late
@@ -322,8 +352,8 @@ def run(controller, run=None, name=None, attach_timeout=30.0):
     `attached`, that is called first with the `Run`. Run and controller name come from the environment
     (`CZ_RUN`, `CZ_CONTROLLER`) unless given.
     """
-    session = Session(run, name, attach_timeout)
-    if hasattr(controller, "attached"):
-        controller.attached(session.run)
-    while session.wait():
-        session.answer(controller)
+    with Session(run, name, attach_timeout) as session:
+        if hasattr(controller, "attached"):
+            controller.attached(session.run)
+        while session.wait():
+            session.answer(controller)

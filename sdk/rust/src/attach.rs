@@ -1,5 +1,6 @@
 //! Joining: ask, read the run's numbers, open the services, say ready.
 
+use crate::space::Space;
 use crate::space::failed;
 use crate::view::{Approach, Run};
 use crate::{Error, Options, space};
@@ -28,8 +29,8 @@ pub(crate) fn name(text: &str) -> Result<ServiceName, Error> {
     ServiceName::new(text).map_err(|e| failed("form a service name", &e))
 }
 
-/// Joins; the node, the line, the reply, and the run.
-pub(crate) fn join(options: &Options) -> Result<(Node<ipc::Service>, Line, AttachReply, Run), Error> {
+/// Joins; the space, the line, the reply, and the run.
+pub(crate) fn join(options: &Options) -> Result<(Space, Line, AttachReply, Run), Error> {
     let deadline = Instant::now() + options.attach_timeout;
     let no_world =
         || Error::NoWorld { run: options.run.clone(), seconds: options.attach_timeout.as_secs_f64() };
@@ -40,9 +41,9 @@ pub(crate) fn join(options: &Options) -> Result<(Node<ipc::Service>, Line, Attac
         }
         std::thread::sleep(LOOK);
     }
-    let node = space::enter(&options.run)?;
+    let space = space::enter(&options.run)?;
     let (requests, replies) = loop {
-        match services(&node)? {
+        match services(space.node())? {
             Some(pair) => break pair,
             None if Instant::now() >= deadline => return Err(no_world()),
             None => std::thread::sleep(LOOK),
@@ -71,7 +72,7 @@ pub(crate) fn join(options: &Options) -> Result<(Node<ipc::Service>, Line, Attac
         return Err(Error::Refused { controller: options.controller.clone(), reason });
     }
     let run = read_run(&bytes, reply.index)?;
-    Ok((node, line, reply, run))
+    Ok((space, line, reply, run))
 }
 
 type Pair = (Publisher<ipc::Service, AttachRequest, ()>, Subscriber<ipc::Service, [u8], AttachReply>);

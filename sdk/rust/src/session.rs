@@ -1,7 +1,7 @@
 //! One attachment to a run, step by step.
 
 use crate::attach::{self, name};
-use crate::space::failed;
+use crate::space::{Space, failed};
 use crate::view::{Run, Step, is_member};
 use crate::{Error, Options};
 use iceoryx2::node::Node;
@@ -36,13 +36,13 @@ const LIFE_CHECK: Duration = Duration::from_millis(50);
 
 /// An attachment to a run.
 pub struct Session {
-    // Ports before the node, so that they are dropped before it.
+    // Ports before the space, so that they are dropped before it.
     pending: Option<Sample<ipc::Service, [VehicleState], FrameHeader>>,
     states: Subscriber<ipc::Service, [VehicleState], FrameHeader>,
     coordination: Subscriber<ipc::Service, [Assignment], FrameHeader>,
     commands: Publisher<ipc::Service, [VehicleCommand], FrameHeader>,
     _line: attach::Line,
-    _node: Node<ipc::Service>,
+    _space: Space,
     run: Run,
     reply: AttachReply,
     next_step: u64,
@@ -73,9 +73,10 @@ impl Commands {
 impl Session {
     /// Joins a run. Once this returns, the world counts on an answer to every step.
     pub fn attach(options: &Options) -> Result<Session, Error> {
-        let (node, line, reply, run) = attach::join(options)?;
-        let states = subscriber(&node, frames::SERVICE_STATE)?;
-        let coordination = subscriber(&node, frames::SERVICE_COORDINATION)?;
+        let (space, line, reply, run) = attach::join(options)?;
+        let node = space.node();
+        let states = subscriber(node, frames::SERVICE_STATE)?;
+        let coordination = subscriber(node, frames::SERVICE_COORDINATION)?;
         let commands = node
             .service_builder(&name(frames::SERVICE_COMMAND)?)
             .publish_subscribe::<[VehicleCommand]>()
@@ -96,7 +97,7 @@ impl Session {
             coordination,
             commands,
             _line: line,
-            _node: node,
+            _space: space,
             next_step: reply.first_step,
             missing: 0,
             is_complete: false,
