@@ -5,8 +5,8 @@
 //! brakes to a stop, a restart in mid-run, and the end of the run. A bad frame is noted under the rule it
 //! breaks and replaced, so that one fault does not hide the others.
 
-use super::{ProcessError, WaitMode};
 use super::attach::Reception;
+use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::scenario::Scenario;

@@ -196,7 +196,8 @@ pub fn run_world(
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
     let bell = rung.then(|| space.bell(frames::BELL_WORLD)).flatten();
-    let mut reception = Reception::open(&space, scenario, run_id, (coordinators, controllers), wait).map_err(active)?;
+    let mut reception =
+        Reception::open(&space, scenario, run_id, (coordinators, controllers), wait).map_err(active)?;
     receive_all(&mut reception, options, stop)?;
     // Bells are hung up by now, so that the ropes hold.
     let ports = services.world_ports(&space, scenario, wait)?;
