@@ -358,7 +358,7 @@ mod tests {
         let request =
             AttachRequest { schema_hash: 0x0123, scenario_hash: 0x4567, ..AttachRequest::default() };
         let reply = AttachReply { schema_hash: 0x89ab, scenario_hash: 0xcdef, ..AttachReply::default() };
-        let said = |status| refusal(&request, &AttachReply { status, ..reply });
+        let said = |status| refusal(&request, &AttachReply { status, ..reply }, "");
         for (status, own, worlds) in [
             (frames::ATTACH_OTHER_SCHEMA, "0000000000000123", "00000000000089ab"),
             (frames::ATTACH_OTHER_SCENARIO, "0000000000004567", "000000000000cdef"),
