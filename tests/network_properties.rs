@@ -182,6 +182,8 @@ fn scenario() -> impl Strategy<Value = Scenario> {
     let dt_ns = prop_oneof![4 => Just(100_000_000_u64), 1 => Just(50_000_000), 1 => Just(200_000_000)];
     (prop::collection::vec(zone(), 1..=6), control(), any::<u64>(), dt_ns).prop_map(
         |(raw, control, seed, dt_ns)| Scenario {
+            plugins: Vec::new(),
+            shield: control_zones::scenario::ShieldMode::Off,
             name: "random".to_owned(),
             seed,
             dt_ns,

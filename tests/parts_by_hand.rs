@@ -5,7 +5,7 @@
 mod common;
 
 use common::{Ended, Site, files, unique_name, wait_until};
-use control_zones::scenario::{load_embedded, scenario_hash};
+use control_zones::scenario::{decode, load_embedded, scenario_hash};
 use control_zones::transport::iox::{AttachLine, RunName, RunSpace, SpaceError};
 use ipc_schemas::{
     ANY_INDEX, ANY_SCENARIO, ATTACH_BAD_ROLE, ATTACH_JOIN, ATTACH_OTHER_SCENARIO, ATTACH_OTHER_SCHEMA,
@@ -191,7 +191,8 @@ fn answer(line: &AttachLine, request: AttachRequest) -> AttachReply {
     wait_until("the world to answer", || {
         while let Some(reply) = line.next_reply().unwrap() {
             if reply.reply().instance == request.instance {
-                assert!(reply.scenario().is_empty(), "the scenario is for those who are let in");
+                // The scenario is for those who are let in; others are told why they are not.
+                assert!(decode(reply.scenario()).is_err(), "a refused participant got the scenario");
                 answer = Some(*reply.reply());
             }
         }
@@ -226,6 +227,7 @@ fn a_participant_of_another_build_is_refused_with_both_hashes() {
         let ours = scenario_hash(&load_embedded("two-merges", &[], None).unwrap());
         let request = AttachRequest {
             instance: 1,
+            controller: ipc_schemas::BUILT_IN,
             schema_hash: schema_hash() ^ 1,
             scenario_hash: ANY_SCENARIO,
             process_id: std::process::id(),

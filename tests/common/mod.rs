@@ -108,7 +108,7 @@ impl Site {
 
 /// The files of a run: in shared memory, and below the given runtime directory.
 pub fn files(runtime: Option<&Path>, run: &str) -> Vec<PathBuf> {
-    let prefix = format!("cz_{}_{run}__", rustix::process::getuid().as_raw());
+    let prefix = format!("cz_{}_{run}_", rustix::process::getuid().as_raw());
     let entries = |d: &Path| std::fs::read_dir(d).into_iter().flatten().flatten().map(|e| e.path());
     let named = |p: &PathBuf| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with(&prefix));
     let mut found: Vec<_> = entries(Path::new("/dev/shm")).filter(named).collect();
