@@ -27,8 +27,8 @@ record! {
     /// One vehicle's command for the step, and what its controller must remember.
     ///
     /// Commands come in the order of the state frame. The `plan_*` fields and `mode` are the
-    /// controller's memory: the world keeps the last ones and hands them to a restarted controller,
-    /// which goes on as if nothing had happened. A controller of another kind may use them freely.
+    /// controller's memory: with them a frame holds all that a controller needs to go on from it. A
+    /// controller of another kind may use them freely.
     #[type_name("cz.VehicleCommand.v1")]
     pub struct VehicleCommand {
         /// Acceleration over `[k * dt, (k + 1) * dt)`, m/s^2.

@@ -1,7 +1,7 @@
 //! The controller role: the vehicles of some zones, from state and coordination frames to commands.
 
 use super::law::{Law, Memory, Mode, Partner, PartnerKind, Program, Situation, Verdict};
-use super::reference::{Reference, Terminal};
+use super::reference::Terminal;
 use super::rows::Row;
 use crate::scenario::{Scenario, ZoneId};
 use crate::vehicle::Inequality;
@@ -343,21 +343,4 @@ fn command(state: &VehicleState, decision: &super::Decision, memory: &Memory) ->
         };
     }
     command
-}
-
-/// The memory a command frame carries (the inverse of what [`ControllerPool::command`] writes).
-pub fn memory_of(command: &VehicleCommand) -> Memory {
-    let mode = if command.mode == frames::MODE_OCBF { Mode::Ocbf } else { Mode::Fe };
-    let plan = (command.plan_duration_s > 0.0).then_some(Reference {
-        start_s: command.plan_start_s,
-        origin_m: command.plan_origin_m,
-        v0_mps: command.plan_v0_mps,
-        optimum: super::Optimum { duration_s: command.plan_duration_s, a: command.plan_a, b: command.plan_b },
-        terminal: if command.plan_terminal_mps < 0.0 {
-            Terminal::Free
-        } else {
-            Terminal::Speed(command.plan_terminal_mps)
-        },
-    });
-    Memory { mode, plan }
 }
