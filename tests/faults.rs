@@ -14,7 +14,7 @@ const SOON: Duration = Duration::from_secs(5);
 const BY_THEMSELVES: Duration = Duration::from_secs(10);
 
 /// The two zones under steady demand for a thousand hours: no machine gets to the end of it.
-const ENDLESS: [&str; 11] = [
+const ENDLESS: [&str; 13] = [
     "varying-demand",
     "--set",
     "end.time_s=3600000",
@@ -26,6 +26,9 @@ const ENDLESS: [&str; 11] = [
     "roads.merge2.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
     "--peer-timeout",
     "60",
+    // Whom others replace: tests/replacement.rs.
+    "--restart",
+    "never",
 ];
 
 /// A process that waits for others uses next to no processor time; one that steps uses all it gets.

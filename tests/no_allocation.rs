@@ -80,7 +80,8 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
     let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 1 };
     let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits).unwrap();
     let coordinator_state = space.create::<VehicleState>("cz/coordinator-state/0", limits).unwrap();
-    let coordination = space.create::<Assignment>(frames::SERVICE_COORDINATION, limits).unwrap();
+    let both = ServiceLimits { subscribers: 2, ..limits };
+    let coordination = space.create::<Assignment>(frames::SERVICE_COORDINATION, both).unwrap();
     let summaries = space.create::<ZoneSummary>("cz/summary/0", limits).unwrap();
     let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits).unwrap();
     let zones = 0..scenario.network.zones.len() as u32;
@@ -95,7 +96,6 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
             coordination: coordination.outbox(256).unwrap(),
         },
         identity(Role::Coordinator),
-        1,
     );
     let mut controller = ControllerDriver::new(
         ControllerPool::new(scenario.clone(), zones),
@@ -111,6 +111,8 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
         state: state.outbox(256).unwrap(),
         coordinator_states: vec![coordinator_state.outbox(256).unwrap()],
         command: command.inbox().unwrap(),
+        // As in a run in which processes may be replaced.
+        coordination: Some(coordination.inbox().unwrap()),
     };
     let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, 7, 1);
     let (mut judge, mut finished) = (Judge::new(LOANS_PER_STEP), false);

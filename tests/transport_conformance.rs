@@ -33,7 +33,7 @@ impl Bench for Memory {
     type In = MemoryInbox<VehicleCommand>;
 
     fn open(senders: usize, receivers: usize) -> Memory {
-        let mut service = MemoryService::new(SERVICE);
+        let mut service = MemoryService::new();
         let inboxes = (0..receivers).map(|_| service.inbox()).collect();
         Memory((0..senders).map(|_| service.outbox()).collect(), inboxes)
     }
@@ -175,7 +175,7 @@ fn frames_in_flight_survive_growth<B: Bench>() {
     check(&held, 1, 2);
 }
 
-fn a_receiver_that_does_not_take_its_frames_is_an_error<B: Bench>() {
+fn a_receiver_that_does_not_take_its_frames_misses_some<B: Bench>() {
     let mut bench = B::open(1, 2);
     let (outboxes, inboxes) = bench.ends();
     let (lazy, diligent) = inboxes.split_at_mut(1);
@@ -183,15 +183,12 @@ fn a_receiver_that_does_not_take_its_frames_is_an_error<B: Bench>() {
         send(&mut outboxes[0], step, 1).unwrap();
         check(&receive(&mut diligent[0]).unwrap(), step, 1);
     }
-    let error = send(&mut outboxes[0], 2, 1).unwrap_err();
-    assert_eq!(error, TransportError::ReceiverFull { service: SERVICE.to_owned() });
-    assert!(error.to_string().contains(SERVICE), "{error}");
+    assert_eq!(send(&mut outboxes[0], 2, 1), Ok(1), "only one has room");
+    check(&receive(&mut diligent[0]).unwrap(), 2, 1);
     // Nothing it had has been overwritten.
     check(&receive(&mut lazy[0]).unwrap(), 0, 1);
     check(&receive(&mut lazy[0]).unwrap(), 1, 1);
     assert!(receive(&mut lazy[0]).is_none());
-    // Whether the diligent one got it is the transport's business; the run is over anyway.
-    while receive(&mut diligent[0]).is_some() {}
     assert_eq!(send(&mut outboxes[0], 3, 1), Ok(2), "there is room again");
     check(&receive(&mut lazy[0]).unwrap(), 3, 1);
 }
@@ -205,7 +202,7 @@ fn the_room_is_per_sender<B: Bench>() {
             send(outbox, step, i).unwrap();
         }
     }
-    assert!(send(&mut outboxes[0], 2, 0).is_err());
+    assert_eq!(send(&mut outboxes[0], 2, 0), Ok(0));
     // From each sender in order; between senders there is no order.
     let mut next = [0; SENDERS];
     while let Some(frame) = receive(&mut inboxes[0]) {
@@ -280,7 +277,7 @@ conformance!(
     a_loan_shows_its_records_before_it_is_sent,
     a_frame_may_be_empty_and_may_grow,
     frames_in_flight_survive_growth,
-    a_receiver_that_does_not_take_its_frames_is_an_error,
+    a_receiver_that_does_not_take_its_frames_misses_some,
     the_room_is_per_sender,
     a_loan_dropped_is_never_seen,
     a_frame_half_written_is_never_seen,

@@ -17,6 +17,8 @@ codes! {
     pub const ATTACH_JOIN: u32 = 1;
     /// [`AttachRequest::phase`]: has been admitted, has opened its ends of the services, and can start.
     pub const ATTACH_READY: u32 = 2;
+    /// [`AttachRequest::phase`]: has fallen behind the run and asks for what it needs to catch up.
+    pub const ATTACH_RESTORE: u32 = 3;
 
     /// [`AttachReply::waiting`]: hot processes poll, coordinators sleep.
     pub const WAITING_HYBRID: u32 = 0;
@@ -37,6 +39,8 @@ codes! {
     pub const ATTACH_BAD_ROLE: u32 = 4;
     /// [`AttachReply::status`]: the scenario declares no controller of that name.
     pub const ATTACH_NO_CONTROLLER: u32 = 5;
+    /// [`AttachReply::status`]: the run is under way and does without newcomers.
+    pub const ATTACH_UNDER_WAY: u32 = 6;
 }
 
 record! {
@@ -62,7 +66,7 @@ record! {
         pub role: u16,
         /// Index wanted among the processes of the role, or 65535 for any.
         pub wanted_index: u16,
-        /// 1 join, 2 ready.
+        /// 1 join, 2 ready, 3 restore.
         pub phase: u32,
         /// Index assigned in the reply to the join; 0 while joining.
         pub index: u32,

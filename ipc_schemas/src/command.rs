@@ -21,6 +21,11 @@ codes! {
     pub const VERDICT_BOUND: u16 = 2;
     /// [`VehicleCommand::verdict`]: no command satisfies all rows; `u_min` was sent.
     pub const VERDICT_INFEASIBLE: u16 = 3;
+    /// [`VehicleCommand::verdict`]: the controller missed its deadline; the acceleration before is held.
+    pub const VERDICT_HELD: u16 = 4;
+    /// [`VehicleCommand::verdict`]: the controller missed its deadline; the acceleration before is held as
+    /// far as the shield allows.
+    pub const VERDICT_FALLBACK: u16 = 5;
 }
 
 record! {
@@ -60,7 +65,8 @@ record! {
         pub binding_rows: u32,
         /// Memory: 0 entered, 1 FE, 2 OCBF.
         pub mode: u16,
-        /// 0 nominal, 1 FE, 2 bound by rows, 3 infeasible.
+        /// 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; put in by the world when a deadline was missed:
+        /// 4 held, 5 held within what the shield allows.
         pub verdict: u16,
     }
 }

@@ -250,6 +250,15 @@ fn seconds(text: &str) -> Result<Duration, String> {
     }
 }
 
+/// What becomes of a run when a participant dies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Restart {
+    /// It ends.
+    Never,
+    /// Another process takes its place and goes on to the same result.
+    OnFailure,
+}
+
 #[derive(Debug, Args)]
 pub(super) struct RunArgs {
     #[command(flatten)]
@@ -278,6 +287,9 @@ pub(super) struct RunArgs {
     /// How the processes of the run wait for frames.
     #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
     pub wait_mode: WaitMode,
+    /// What becomes of the run when a coordinator or a process of the built-in pool dies.
+    #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
+    pub restart: Restart,
 }
 
 #[derive(Debug, Args)]
@@ -297,6 +309,9 @@ pub(super) struct WorldArgs {
     /// How the processes of the run wait for frames.
     #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
     pub wait_mode: WaitMode,
+    /// What becomes of the run when a coordinator or a process of the built-in pool dies.
+    #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
+    pub restart: Restart,
     /// Process id of the supervisor: report to it on stdout, and end with it.
     #[arg(long, hide = true, value_name = "PID")]
     pub supervised: Option<u32>,

@@ -1,6 +1,6 @@
 //! `cz bench`: measurements.
 
-use super::args::{BenchArgs, BenchKind, PeerArgs, ScenarioArgs, ShareArgs, WaitArgs};
+use super::args::{BenchArgs, BenchKind, PeerArgs, Restart, ScenarioArgs, ShareArgs, WaitArgs};
 use super::supervise::{Plan, supervise};
 use super::{AppError, print};
 use crate::bench::{
@@ -71,6 +71,7 @@ fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, S
         pool: controllers,
         wait: WAIT,
         wait_mode: WaitMode::Hybrid,
+        restart: Restart::Never,
     };
     supervise(&plan, |_| {}).map_err(|e| e.to_string())
 }

@@ -1,7 +1,7 @@
 //! `cz world`, `cz coord`, `cz ctrl`: one process of a run.
 
 use super::AppError;
-use super::args::{PartArgs, WorldArgs};
+use super::args::{PartArgs, Restart, WorldArgs};
 use super::report::{Summary, Transport};
 use super::supervise::WorldLine;
 use crate::process::{Joining, StopFlag, WorldOptions, place, run_controller, run_coordinator, run_world};
@@ -27,6 +27,7 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         attach_timeout: args.wait.attach_timeout,
         peer_timeout: args.wait.peer_timeout,
         wait: args.wait_mode,
+        replace: args.restart == Restart::OnFailure,
     };
     place(args.wait.pin, Role::World, 0);
     if args.supervised.is_some() {

@@ -1,7 +1,8 @@
 //! The summary of a run: as JSON, and as a table for people.
 
 use super::{AppError, print};
-use crate::process::{LatencyUs, Outcome};
+use crate::lockstep::RefusedFrames;
+use crate::process::{LatencyUs, Outcome, Replacement};
 use crate::scenario::{Scenario, ShieldMode};
 use crate::world::{ShieldSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
@@ -28,6 +29,9 @@ pub(super) struct Summary {
     held_arrivals: u32,
     waiting: u32,
     shield: ShieldSummary,
+    replacements: Vec<Replacement>,
+    refused: Vec<RefusedFrames>,
+    late_frames: u64,
 }
 
 /// How the frames of a run travelled.
@@ -62,6 +66,9 @@ impl Summary {
             held_arrivals: world.held_arrivals,
             waiting: world.waiting,
             shield: world.shield,
+            replacements: outcome.replacements,
+            refused: outcome.refused,
+            late_frames: outcome.late_frames,
         }
     }
 
@@ -146,6 +153,15 @@ impl Summary {
             ));
         }
         shield_lines(&self.shield, &mut text);
+        for r in &self.replacements {
+            text.push_str(&format!(
+                "{} was replaced at step {} (generation {}); the step took {:.1} ms\n",
+                r.participant, r.step, r.generation, r.step_ms
+            ));
+        }
+        for r in &self.refused {
+            text.push_str(&format!("refused {} frames of {}; the last: {}\n", r.frames, r.sender, r.last));
+        }
         text.push_str(&format!("state hash {}\n", self.state_hash));
         text
     }

@@ -42,6 +42,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
             share: args.share,
             wait: args.wait,
             wait_mode: args.wait_mode,
+            restart: args.restart,
         };
         (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
     };

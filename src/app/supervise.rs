@@ -1,7 +1,7 @@
 //! The supervisor: starts the processes of a run, watches them, and leaves nothing behind.
 
 use super::AppError;
-use super::args::{ScenarioArgs, ShareArgs, WaitArgs};
+use super::args::{Restart, ScenarioArgs, ShareArgs, WaitArgs};
 use super::run::Position;
 use crate::process::{Outcome, ProcessError, WaitMode};
 use crate::scenario::Plugin;
@@ -42,7 +42,16 @@ pub(super) struct Plan<'a> {
     pub plugins: &'a [Plugin],
     /// Number of processes of the built-in pool.
     pub pool: u32,
+    /// What becomes of the run when a participant dies.
+    pub restart: Restart,
 }
+
+/// A part that dies this often, each time soon after it was started, is given up.
+const MAX_RESTARTS: u32 = 8;
+/// A part that has lived this long has proved itself.
+const PROBATION: Duration = Duration::from_secs(5);
+/// The second restart in a row waits this long, each further one twice as long as the one before.
+const BACK_OFF: Duration = Duration::from_millis(10);
 
 /// How long the others may take to end by themselves once one has failed, and once asked to.
 const GRACE: Duration = Duration::from_secs(2);
@@ -62,7 +71,8 @@ pub(super) fn supervise(plan: &Plan<'_>, progress: impl FnMut(Position)) -> Resu
 
     claim(&plan.run)?;
     let (events, inbox) = unbounded();
-    let mut family = Family { children: Vec::new(), plugins: Vec::new(), events };
+    let mut family =
+        Family { children: Vec::new(), plugins: Vec::new(), events, restart: plan.restart, due: Vec::new() };
     let result = family.start(plan).and_then(|()| family.watch(&inbox, &signals, progress));
     if result.is_err() {
         family.end(&inbox);
@@ -103,12 +113,28 @@ struct Family {
     /// Which of them are controllers written elsewhere, each leading a process group.
     plugins: Vec<usize>,
     events: Sender<Event>,
+    restart: Restart,
+    /// Who is to be started again, and when.
+    due: Vec<(Instant, Part)>,
+}
+
+/// How to start a process of ours.
+#[derive(Clone, Debug)]
+struct Part {
+    name: String,
+    command: &'static str,
+    arguments: Vec<String>,
+    /// Restarts in a row.
+    restarts: u32,
 }
 
 struct Member {
     name: String,
     pid: u32,
     running: bool,
+    /// How to start it again, unless it is a plug-in.
+    part: Option<Part>,
+    since: Instant,
     /// The last thing it said on stderr.
     last_words: Option<String>,
 }
@@ -127,15 +153,16 @@ impl Family {
         world.extend(["--ctrl-procs".to_owned(), plan.share.ctrl_procs.to_string()]);
         world.extend(["--coord-procs".to_owned(), plan.share.coord_procs.to_string()]);
         world.extend(["--wait".to_owned(), name(plan.wait_mode.to_possible_value())]);
+        world.extend(["--restart".to_owned(), name(plan.restart.to_possible_value())]);
         world.extend(plan.scenario.to_arguments());
-        self.spawn("world".to_owned(), "world", world)?;
+        self.spawn(Part { name: "world".to_owned(), command: "world", arguments: world, restarts: 0 })?;
         for (role, command, count) in
             [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
         {
             for index in 0..count {
                 let mut arguments = common.clone();
                 arguments.extend(["--index".to_owned(), index.to_string()]);
-                self.spawn(format!("{role} {index}"), command, arguments)?;
+                self.spawn(Part { name: format!("{role} {index}"), command, arguments, restarts: 0 })?;
             }
         }
         for plugin in plan.plugins {
@@ -160,8 +187,14 @@ impl Family {
             .spawn()
             .map_err(|e| AppError::Failed(format!("cannot start controller {name}: {e}")))?;
         let index = self.children.len();
-        let member =
-            Member { name: format!("controller {name}"), pid: child.id(), running: true, last_words: None };
+        let member = Member {
+            name: format!("controller {name}"),
+            pid: child.id(),
+            running: true,
+            part: None,
+            since: Instant::now(),
+            last_words: None,
+        };
         self.children.push(member);
         let prefix = name.to_owned();
         let stdout = child.stdout.take();
@@ -175,21 +208,60 @@ impl Family {
         Ok(())
     }
 
-    fn spawn(&mut self, name: String, command: &str, arguments: Vec<String>) -> Result<(), AppError> {
+    fn spawn(&mut self, part: Part) -> Result<(), AppError> {
+        let Part { name, command, arguments, .. } = &part;
         let failed = |e: std::io::Error| AppError::Failed(format!("cannot start the {name}: {e}"));
         let program = std::env::current_exe().map_err(failed)?;
         let mut child = Command::new(program)
             .arg(command)
             .args(arguments)
             .stdin(Stdio::null())
-            .stdout(if command == "world" { Stdio::piped() } else { Stdio::null() })
+            .stdout(if *command == "world" { Stdio::piped() } else { Stdio::null() })
             .stderr(Stdio::piped())
             .spawn()
             .map_err(failed)?;
         let index = self.children.len();
-        self.children.push(Member { name, pid: child.id(), running: true, last_words: None });
+        self.children.push(Member {
+            name: name.clone(),
+            pid: child.id(),
+            running: true,
+            part: Some(part),
+            since: Instant::now(),
+            last_words: None,
+        });
         self.listen(index, &mut child);
         Ok(())
+    }
+
+    /// Arranges for a coordinator or controller that has died to be started again. Whoever was asked to
+    /// end, and ended, is not.
+    fn replace(&mut self, child: usize, status: &std::io::Result<ExitStatus>) -> bool {
+        let world_runs = self.children.first().is_some_and(|world| world.running);
+        let deliberate = status.as_ref().is_ok_and(|s| s.code() == Some(130));
+        let member = &self.children[child];
+        let Some(part) = member.part.as_ref().filter(|part| part.command != "world") else { return false };
+        if self.restart == Restart::Never || deliberate || !world_runs {
+            return false;
+        }
+        let in_a_row = if member.since.elapsed() >= PROBATION { 0 } else { part.restarts };
+        if in_a_row >= MAX_RESTARTS {
+            return false;
+        }
+        let pause = if in_a_row == 0 { Duration::ZERO } else { BACK_OFF * (1 << (in_a_row - 1)) };
+        self.due.push((Instant::now() + pause, Part { restarts: in_a_row + 1, ..part.clone() }));
+        true
+    }
+
+    /// Starts whoever is due; returns how long until the next one is.
+    fn restart_due(&mut self) -> Result<Option<Duration>, AppError> {
+        let now = Instant::now();
+        let (due, later): (Vec<_>, Vec<_>) =
+            std::mem::take(&mut self.due).into_iter().partition(|(at, _)| *at <= now);
+        self.due = later;
+        for (_, part) in due {
+            self.spawn(part)?;
+        }
+        Ok(self.due.iter().map(|(at, _)| at.saturating_duration_since(now)).min())
     }
 
     /// A thread per child passes on what it says and, after its last word, how it ended.
@@ -228,7 +300,7 @@ impl Family {
             let patience = match &failure {
                 // The others notice within moments; what they say on the way out is worth having.
                 Some((_, since)) => GRACE.saturating_sub(since.elapsed()),
-                None => Duration::from_secs(3600),
+                None => self.restart_due()?.unwrap_or(Duration::from_secs(3600)),
             };
             select! {
                 recv(signals) -> signal => {
@@ -245,10 +317,13 @@ impl Family {
                         self.children[child].last_words = Some(line);
                     }
                     Event::Ended { child, status } => {
-                        let member = &mut self.children[child];
-                        member.running = false;
+                        self.children[child].running = false;
                         if let Some(how) = describe_failure(&status) {
-                            let text = message(member, &how);
+                            let text = message(&self.children[child], &how);
+                            if failure.is_none() && self.replace(child, &status) {
+                                eprintln!("cz: {text}; it is started again");
+                                continue;
+                            }
                             match &mut failure {
                                 None => failure = Some((AppError::Failed(text), Instant::now())),
                                 Some((AppError::Failed(all), _)) => {

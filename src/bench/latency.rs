@@ -245,8 +245,8 @@ fn socket_step(
     };
     let connection = Connection::new(stream);
     let mut coordinator_state: MemoryService<VehicleState> =
-        MemoryService::new(frames::SERVICE_COORDINATOR_STATE_PREFIX);
-    let mut summaries: MemoryService<ZoneSummary> = MemoryService::new(frames::SERVICE_SUMMARY_PREFIX);
+        MemoryService::new();
+    let mut summaries: MemoryService<ZoneSummary> = MemoryService::new();
     let zones = 0..scenario.network.zones.len() as u32;
     let coordinator_ports = CoordinatorPorts::<_, MemoryInbox<ZoneSummary>, _, _> {
         state: coordinator_state.inbox(),
@@ -257,11 +257,12 @@ fn socket_step(
     };
     let identity = Identity { run_id: 1, role: Role::Coordinator, index: 0, generation: 0 };
     let mut coordinator =
-        CoordinatorDriver::new(Coordinator::new(scenario.clone(), zones), coordinator_ports, identity, 1);
+        CoordinatorDriver::new(Coordinator::new(scenario.clone(), zones), coordinator_ports, identity);
     let ports = WorldPorts {
         state: connection.outbox::<VehicleState>(),
         coordinator_states: vec![coordinator_state.outbox()],
         command: connection.inbox::<VehicleCommand>(),
+        coordination: None::<MemoryInbox<Assignment>>,
     };
     let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, 1, 1);
     let mut steady = new_histogram();

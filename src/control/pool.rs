@@ -1,7 +1,7 @@
 //! The controller role: the vehicles of some zones, from state and coordination frames to commands.
 
 use super::law::{Law, Memory, Mode, Partner, PartnerKind, Program, Situation, Verdict};
-use super::reference::Terminal;
+use super::reference::{Optimum, Reference, Terminal};
 use super::rows::Row;
 use crate::scenario::{Scenario, ZoneId};
 use crate::vehicle::Inequality;
@@ -129,9 +129,40 @@ impl ControllerPool {
         for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
             let zone = group[0].zone;
             if self.zones.contains(&zone) {
-                let from = states.partition_point(|s| s.zone < zone);
-                let to = from + states[from..].partition_point(|s| s.zone == zone);
-                self.crews[(zone - self.zones.start) as usize].assign(zone, &states[from..to], group)?;
+                let slice = zone_slice(states, zone);
+                self.crews[(zone - self.zones.start) as usize].assign(zone, slice, group)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes over from another pool: what it remembered stands in its last commands, and `in_force` is the
+    /// coordination its zones were under before the step of `states`. A zone that has changed since is left
+    /// without assignments; its coordinator sends new ones in this very step.
+    ///
+    /// # Errors
+    /// When the assignments contradict the state.
+    pub fn restore(
+        &mut self,
+        states: &[VehicleState],
+        commands: &[VehicleCommand],
+        in_force: &[Assignment],
+    ) -> Result<(), PoolError> {
+        self.crews.iter_mut().for_each(|crew| *crew = Crew::default());
+        for group in commands.chunk_by(|a, b| a.zone == b.zone) {
+            if self.zones.contains(&group[0].zone) {
+                let crew = &mut self.crews[(group[0].zone - self.zones.start) as usize];
+                crew.members.extend(group.iter().map(Member::remembered));
+            }
+        }
+        for group in in_force.chunk_by(|a, b| a.zone == b.zone) {
+            let zone = group[0].zone;
+            if self.zones.contains(&zone) {
+                let slice = zone_slice(states, zone);
+                let members = slice.iter().filter(|s| s.flags & frames::STATE_LEFT == 0).map(|s| s.vehicle);
+                if members.eq(group.chunk_by(|a, b| a.vehicle == b.vehicle).map(|g| g[0].vehicle)) {
+                    self.crews[(zone - self.zones.start) as usize].assign(zone, slice, group)?;
+                }
             }
         }
         Ok(())
@@ -224,6 +255,25 @@ impl ControllerPool {
     fn own<'a>(&self, states: &'a [VehicleState]) -> &'a [VehicleState] {
         &states[self.own_range(states)]
     }
+}
+
+impl Member {
+    /// A vehicle as its controller remembered it when it sent this command.
+    fn remembered(command: &VehicleCommand) -> Member {
+        Member {
+            vehicle: command.vehicle,
+            terminal: Terminal::Free,
+            memory: memory(command),
+            first_constraint: 0,
+            end_constraint: 0,
+        }
+    }
+}
+
+/// A zone's S(t) in a state frame.
+fn zone_slice(states: &[VehicleState], zone: ZoneId) -> &[VehicleState] {
+    let from = states.partition_point(|s| s.zone < zone);
+    &states[from..from + states[from..].partition_point(|s| s.zone == zone)]
 }
 
 impl Crew {
@@ -343,4 +393,24 @@ fn command(state: &VehicleState, decision: &super::Decision, memory: &Memory) ->
         };
     }
     command
+}
+
+/// The memory a command carries; the inverse of what [`command`] writes.
+fn memory(command: &VehicleCommand) -> Memory {
+    let plan = (command.plan_duration_s > 0.0).then_some(Reference {
+        start_s: command.plan_start_s,
+        origin_m: command.plan_origin_m,
+        v0_mps: command.plan_v0_mps,
+        optimum: Optimum {
+            a: command.plan_a,
+            b: command.plan_b,
+            duration_s: command.plan_duration_s,
+        },
+        terminal: if command.plan_terminal_mps < 0.0 {
+            Terminal::Free
+        } else {
+            Terminal::Speed(command.plan_terminal_mps)
+        },
+    });
+    Memory { mode: if command.mode == frames::MODE_OCBF { Mode::Ocbf } else { Mode::Fe }, plan }
 }

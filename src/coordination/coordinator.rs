@@ -2,8 +2,9 @@
 
 use super::flow::FlowController;
 use super::partners;
+use super::summaries::{Audience, is_event};
 use crate::scenario::{Scenario, ZoneId};
-use ipc_schemas::{Assignment, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState, ZoneSummary};
+use ipc_schemas::{Assignment, VehicleState, ZoneSummary};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -32,8 +33,7 @@ pub struct Coordinator {
 #[derive(Debug)]
 struct Desk {
     flow: FlowController,
-    /// For each neighbour, the segment of this zone it observes, m.
-    audience: Vec<(ZoneId, f64)>,
+    audience: Audience,
     downstream: Option<ZoneSummary>,
     told: bool,
 }
@@ -46,14 +46,7 @@ impl Coordinator {
             .clone()
             .map(|zone| Desk {
                 flow: FlowController::new(&scenario, zone),
-                audience: network
-                    .neighbours(zone)
-                    .map(|n| {
-                        // Only the upstream neighbour's policy looks into this zone.
-                        let looks = network.downstream(n) == Some(zone);
-                        (n, if looks { FlowController::new(&scenario, n).segment_m() } else { 0.0 })
-                    })
-                    .collect(),
+                audience: Audience::of(network, zone),
                 downstream: None,
                 told: false,
             })
@@ -86,6 +79,17 @@ impl Coordinator {
         }
     }
 
+    /// Takes over from another coordinator: `downstream` are the last summaries its zones acted on, `due`
+    /// those sent in the step before the first this one acts in.
+    pub fn restore(&mut self, downstream: &[ZoneSummary], due: &[ZoneSummary]) {
+        for summary in downstream {
+            if self.zones.contains(&summary.to_zone) {
+                self.desks[(summary.to_zone - self.zones.start) as usize].downstream = Some(*summary);
+            }
+        }
+        self.receive(due);
+    }
+
     /// Acts on a state frame that holds at least the zones that act. Afterwards [`assignments`](Self::assignments) and
     /// [`summaries`](Self::summaries) hold what is to be sent. Returns whether a zone of this process had
     /// an event of its own, in which case every neighbouring process expects a summary frame.
@@ -107,12 +111,11 @@ impl Coordinator {
             }
             let desk = &mut self.desks[(zone - self.zones.start) as usize];
             let told = desk.told;
-            let event = slice.iter().any(|s| s.flags & (STATE_ENTERED | STATE_LEFT_NOW) != 0);
+            let event = is_event(slice);
             had_event |= event;
             if event {
-                for &(neighbour, segment_m) in &desk.audience {
-                    let summary = summarise(zone, neighbour, segment_m, slice);
-                    if self.zones.contains(&neighbour) {
+                for summary in desk.audience.summaries(zone, slice) {
+                    if self.zones.contains(&summary.to_zone) {
                         self.internal.push(summary);
                     } else {
                         self.external.push(summary);
@@ -139,29 +142,5 @@ impl Coordinator {
     /// The summaries for zones of the given range (another process's).
     pub fn summaries(&self, zones: Range<ZoneId>) -> impl Iterator<Item = ZoneSummary> + '_ {
         self.external.iter().filter(move |s| zones.contains(&s.to_zone)).copied()
-    }
-}
-
-fn summarise(zone: ZoneId, to_zone: ZoneId, segment_m: f64, slice: &[VehicleState]) -> ZoneSummary {
-    let members = slice.iter().filter(|s| s.flags & STATE_LEFT == 0);
-    let (mut vehicles, mut segment_vehicles, mut speed_sum) = (0, 0, 0.0);
-    for state in members {
-        vehicles += 1;
-        if state.x_m <= segment_m {
-            segment_vehicles += 1;
-            speed_sum += state.v_mps;
-        }
-    }
-    ZoneSummary {
-        segment_m,
-        segment_mean_speed_mps: if segment_vehicles > 0 {
-            speed_sum / f64::from(segment_vehicles)
-        } else {
-            0.0
-        },
-        from_zone: zone,
-        to_zone,
-        vehicles,
-        segment_vehicles,
     }
 }

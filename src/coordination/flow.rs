@@ -15,6 +15,15 @@ pub struct FlowController {
     v_max_mps: f64,
 }
 
+/// Length of the downstream segment a policy observes, m (0 when it observes none).
+pub fn segment_m(policy: &FlowPolicy) -> f64 {
+    match policy {
+        FlowPolicy::Feedback { segment: Segment::First(l), .. } => *l,
+        FlowPolicy::MeanSpeed { segment_m, .. } => *segment_m,
+        _ => 0.0,
+    }
+}
+
 impl FlowController {
     /// The controller of a zone; a computed baseline is computed here, once.
     pub fn new(scenario: &Scenario, zone: ZoneId) -> FlowController {
@@ -29,15 +38,6 @@ impl FlowController {
             _ => 0.0,
         };
         FlowController { policy: zone.flow.clone(), baseline_mps, v_max_mps: scenario.vehicle.v_max_mps }
-    }
-
-    /// Length of the downstream segment the policy observes, m (0 when it observes none).
-    pub fn segment_m(&self) -> f64 {
-        match &self.policy {
-            FlowPolicy::Feedback { segment: Segment::First(l), .. } => *l,
-            FlowPolicy::MeanSpeed { segment_m, .. } => *segment_m,
-            _ => 0.0,
-        }
     }
 
     /// The terminal condition, given the last summary of the downstream zone (none before its first

@@ -3,6 +3,8 @@
 mod coordinator;
 mod flow;
 mod partners;
+mod summaries;
 
 pub use coordinator::Coordinator;
 pub use flow::FlowController;
+pub use summaries::{Audience, is_event};

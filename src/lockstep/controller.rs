@@ -1,10 +1,13 @@
 //! A controller process's side of a step: take the state, wait for coordination if there is any, answer.
 
+use super::refusals::Refusals;
 use super::world::check_state;
-use super::{Awaited, Identity, LockstepError, Progress, sender};
+use super::{Awaited, Handover, Identity, InHand, LockstepError, Progress, Refusal, RefusedFrames};
 use crate::control::ControllerPool;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
-use ipc_schemas::{Assignment, ExpectedHeader, FLAG_END_OF_RUN, Role, VehicleCommand, VehicleState};
+use ipc_schemas::{
+    Assignment, ExpectedHeader, FLAG_END_OF_RUN, HeaderFault, Role, VehicleCommand, VehicleState,
+};
 
 /// A controller's ends of the services.
 #[derive(Debug)]
@@ -27,8 +30,11 @@ where
     ports: ControllerPorts<S, A, C>,
     identity: Identity,
     next_step: u64,
-    /// The state frame being answered, and the coordinators whose frames it still needs.
-    pending: Option<(S::Frame, u64)>,
+    /// The state being answered, and the coordinators whose frames it still needs.
+    pending: Option<(InHand<S::Frame>, u64)>,
+    /// What is to be taken over with the next state.
+    inherited: Option<Handover>,
+    refusals: Refusals,
     finished: bool,
 }
 
@@ -45,7 +51,32 @@ where
         identity: Identity,
         first_step: u64,
     ) -> ControllerDriver<S, A, C> {
-        ControllerDriver { pool, ports, identity, next_step: first_step, pending: None, finished: false }
+        ControllerDriver {
+            pool,
+            ports,
+            identity,
+            next_step: first_step,
+            pending: None,
+            inherited: None,
+            refusals: Refusals::default(),
+            finished: false,
+        }
+    }
+
+    /// Goes on from what another has left, or from where the run is now.
+    pub fn take_over(&mut self, mut handover: Handover) {
+        self.next_step = handover.step;
+        self.pending = None;
+        if let Some(header) = handover.header.take() {
+            let states = std::mem::take(&mut handover.states);
+            self.pending = Some((InHand::Handed(header, states), header.coordinators_acting));
+        }
+        self.inherited = Some(handover);
+    }
+
+    /// What was refused, by sender.
+    pub fn refused(&self) -> Vec<RefusedFrames> {
+        self.refusals.report()
     }
 
     /// Does what can be done now.
@@ -55,6 +86,7 @@ where
         }
         match self.pending.take() {
             None => self.take_state(),
+            Some((state, missing)) if self.inherited.is_some() => self.inherit(state, missing),
             Some((state, 0)) => self.answer(&state),
             Some((state, missing)) => self.take_coordination(state, missing),
         }
@@ -65,46 +97,114 @@ where
         let Some(state) = self.ports.state.receive()? else {
             return Ok(Progress::Waiting(Awaited { role: Role::World, missing: 1, what: "state", step }));
         };
-        check_state(self.identity.run_id, Some(step), state.header(), state.records().len())?;
-        if state.header().flags & FLAG_END_OF_RUN != 0 {
+        check_state(self.identity.run_id, state.header(), state.records().len())?;
+        let header = state.header();
+        if header.flags & FLAG_END_OF_RUN != 0 {
             self.finished = true;
             return Ok(Progress::Finished);
         }
-        let missing = state.header().coordinators_acting;
+        if header.step < step {
+            // It was handed over with the rest, or the run went on without this one.
+            return Ok(Progress::Advanced);
+        }
+        if header.step > step {
+            return Ok(Progress::Behind);
+        }
+        let missing = header.coordinators_acting;
+        self.pending = Some((InHand::Frame(state), missing));
+        Ok(Progress::Advanced)
+    }
+
+    /// Takes over with the first state at hand.
+    fn inherit(&mut self, state: InHand<S::Frame>, mut missing: u64) -> Result<Progress, LockstepError> {
+        let step = self.next_step;
+        if let Some(handover) = self.inherited.take() {
+            let states = state.records();
+            self.pool
+                .restore(states, &handover.commands, &handover.in_force)
+                .map_err(|fault| LockstepError::Pool { step, fault })?;
+            for (coordinator, assignments) in &handover.coordination {
+                self.pool
+                    .coordinate(states, assignments)
+                    .map_err(|fault| LockstepError::Pool { step, fault })?;
+                missing &= !(1 << coordinator);
+            }
+        }
         self.pending = Some((state, missing));
         Ok(Progress::Advanced)
     }
 
-    fn take_coordination(&mut self, state: S::Frame, mut missing: u64) -> Result<Progress, LockstepError> {
+    fn take_coordination(
+        &mut self,
+        state: InHand<S::Frame>,
+        mut missing: u64,
+    ) -> Result<Progress, LockstepError> {
         let step = self.next_step;
         let Some(frame) = self.ports.coordination.receive()? else {
+            // If the run has gone on, what is missing here will never come.
+            if let Some(next) = self.ports.state.receive()? {
+                let run_id = self.identity.run_id;
+                check_state(run_id, next.header(), next.records().len())?;
+                if next.header().flags & FLAG_END_OF_RUN != 0 {
+                    self.finished = true;
+                    return Ok(Progress::Finished);
+                }
+                if next.header().step > step {
+                    return Ok(Progress::Behind);
+                }
+            }
             self.pending = Some((state, missing));
             let what = "coordination";
             return Ok(Progress::Waiting(Awaited { role: Role::Coordinator, missing, what, step }));
         };
+        match self.judge(&frame, &state, missing) {
+            Ok(index) => missing &= !(1 << index),
+            Err(None) => self.refusals.late += 1,
+            Err(Some(refusal)) => {
+                let inbox = &self.ports.coordination;
+                let origin = frame.origin();
+                self.refusals.enter(frame.header(), origin, refusal, || inbox.process_of(origin));
+            }
+        }
+        self.pending = Some((state, missing));
+        Ok(Progress::Advanced)
+    }
+
+    /// Takes the frame; returns its sender, or why it is not taken, or nothing for one that is merely late.
+    fn judge(
+        &mut self,
+        frame: &A::Frame,
+        state: &InHand<S::Frame>,
+        missing: u64,
+    ) -> Result<u16, Option<Refusal>> {
         let header = frame.header();
-        let index = header.sender_index;
-        ExpectedHeader {
+        let (step, index) = (self.next_step, header.sender_index);
+        let checked = ExpectedHeader {
             run_id: self.identity.run_id,
             role: Role::Coordinator,
             index,
             generation: header.generation,
             step,
         }
-        .check(header, frame.records().len())
-        .map_err(|fault| LockstepError::Header { sender: sender(header), fault })?;
-        if index >= 64 || missing >> index & 1 == 0 {
-            return Err(LockstepError::Unexpected { sender: sender(header), step });
+        .check(header, frame.records().len());
+        match checked {
+            Err(HeaderFault::OtherStep { expected, found }) if found < expected => return Err(None),
+            Err(fault) => return Err(Some(fault.into())),
+            Ok(()) => {}
+        }
+        if index >= 64 {
+            return Err(Some(Refusal::Unexpected { step }));
+        }
+        if missing >> index & 1 == 0 {
+            return Err(None);
         }
         self.pool
             .coordinate(state.records(), frame.records())
-            .map_err(|fault| LockstepError::Pool { step, fault })?;
-        missing &= !(1 << index);
-        self.pending = Some((state, missing));
-        Ok(Progress::Advanced)
+            .map_err(|fault| Some(Refusal::Coordination { step, fault }))?;
+        Ok(index)
     }
 
-    fn answer(&mut self, state: &S::Frame) -> Result<Progress, LockstepError> {
+    fn answer(&mut self, state: &InHand<S::Frame>) -> Result<Progress, LockstepError> {
         let step = self.next_step;
         let time_ns = state.header().time_ns;
         let header = self.identity.header(step, time_ns);
@@ -121,11 +221,7 @@ where
             (written..count).for_each(|_| slots.push(VehicleCommand::default()));
         })?;
         outcome.map_err(|fault| LockstepError::Pool { step, fault })?;
-        let reached = loan.send()?;
-        if reached != 1 {
-            let what = "the command frame";
-            return Err(LockstepError::LostReceiver { what, step, reached, expected: 1 });
-        }
+        loan.send()?;
         self.next_step += 1;
         Ok(Progress::Advanced)
     }

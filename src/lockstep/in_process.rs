@@ -10,11 +10,15 @@ use crate::scenario::Scenario;
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
 use crate::world::World;
-use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::sync::Arc;
 
-type WorldSide =
-    WorldDriver<MemoryOutbox<VehicleState>, MemoryOutbox<VehicleState>, MemoryInbox<VehicleCommand>>;
+type WorldSide = WorldDriver<
+    MemoryOutbox<VehicleState>,
+    MemoryOutbox<VehicleState>,
+    MemoryInbox<VehicleCommand>,
+    MemoryInbox<Assignment>,
+>;
 type CoordinatorSide = CoordinatorDriver<
     MemoryInbox<VehicleState>,
     MemoryInbox<ZoneSummary>,
@@ -39,13 +43,13 @@ impl InProcess {
         let scenario = &Arc::new(scenario.without_plugins());
         let zones = scenario.network.zones.len() as u32;
         let run_id = 1;
-        let mut state = MemoryService::new(frames::SERVICE_STATE);
-        let mut coordination = MemoryService::new(frames::SERVICE_COORDINATION);
-        let mut command = MemoryService::new(frames::SERVICE_COMMAND);
+        let mut state = MemoryService::new();
+        let mut coordination = MemoryService::new();
+        let mut command = MemoryService::new();
         let mut coordinator_states: Vec<MemoryService<VehicleState>> =
-            (0..coordinators).map(|_| MemoryService::new(frames::SERVICE_COORDINATOR_STATE_PREFIX)).collect();
+            (0..coordinators).map(|_| MemoryService::new()).collect();
         let mut summaries: Vec<MemoryService<ZoneSummary>> =
-            (0..coordinators).map(|_| MemoryService::new(frames::SERVICE_SUMMARY_PREFIX)).collect();
+            (0..coordinators).map(|_| MemoryService::new()).collect();
         // All inboxes before any outbox.
         let controller_inboxes: Vec<_> =
             (0..controllers).map(|_| (state.inbox(), coordination.inbox())).collect();
@@ -69,7 +73,7 @@ impl InProcess {
                     coordination: coordination.outbox(),
                 };
                 let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
-                CoordinatorDriver::new(role, ports, identity(Role::Coordinator, index), controllers)
+                CoordinatorDriver::new(role, ports, identity(Role::Coordinator, index))
             })
             .collect();
         let controllers_side = controller_inboxes
@@ -85,6 +89,7 @@ impl InProcess {
             state: state.outbox(),
             coordinator_states: coordinator_states.iter().map(MemoryService::outbox).collect(),
             command: command_inbox,
+            coordination: None,
         };
         let world = World::new(scenario.clone(), coordinators);
         InProcess {
@@ -120,7 +125,7 @@ impl InProcess {
             match self.world.advance()? {
                 Progress::Finished => return Ok(false),
                 Progress::Advanced => progress = true,
-                Progress::Waiting(_) => {}
+                Progress::Waiting(_) | Progress::Behind => {}
             }
             if self.world().step() != step {
                 return Ok(true);

@@ -7,16 +7,19 @@
 mod controller;
 mod coordinator;
 pub mod in_process;
+mod ledger;
+mod refusals;
 mod world;
 
 pub use controller::{ControllerDriver, ControllerPorts};
 pub use coordinator::{CoordinatorDriver, CoordinatorPorts};
-pub use world::{WorldDriver, WorldPorts};
+pub use ledger::{Handover, Ledger};
+pub use refusals::{Refusal, RefusedFrames};
+pub use world::{Seat, WorldDriver, WorldPorts};
 
 use crate::control::pool::PoolError;
-use crate::transport::TransportError;
-use crate::world::CommandFault;
-use ipc_schemas::{FrameHeader, HeaderFault, Role};
+use crate::transport::{Frame, TransportError};
+use ipc_schemas::{FrameHeader, HeaderFault, Role, VehicleState};
 
 /// What a driver did.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,6 +28,8 @@ pub enum Progress {
     Advanced,
     /// Nothing: a frame is missing.
     Waiting(Awaited),
+    /// The run has gone on without this participant, which must be handed over to before it can go on.
+    Behind,
     /// The run is over.
     Finished,
 }
@@ -92,43 +97,13 @@ pub enum LockstepError {
     /// The transport failed.
     #[error(transparent)]
     Transport(#[from] TransportError),
-    /// A frame's header is not what the protocol asks for.
+    /// The world's frame is not what the protocol asks for.
     #[error("frame from {sender}: {fault}")]
     Header {
         /// Who sent it.
         sender: String,
         /// What is wrong.
         fault: HeaderFault,
-    },
-    /// Two frames of the same step from the same sender, or one nobody asked for.
-    #[error("{sender} sent an unexpected frame for step {step}")]
-    Unexpected {
-        /// Who sent it.
-        sender: String,
-        /// Step in its header.
-        step: u64,
-    },
-    /// A frame reached fewer receivers than the run has.
-    #[error("step {step}: {what} reached {reached} of {expected} receivers")]
-    LostReceiver {
-        /// What was sent.
-        what: &'static str,
-        /// Step.
-        step: u64,
-        /// Receivers reached.
-        reached: usize,
-        /// Receivers expected.
-        expected: usize,
-    },
-    /// A controller's commands do not fit the state.
-    #[error("step {step}, {sender}: {fault}")]
-    Command {
-        /// Step.
-        step: u64,
-        /// Who sent them.
-        sender: String,
-        /// What is wrong.
-        fault: CommandFault,
     },
     /// All controllers answered but some vehicles have no command.
     #[error("step {step}: {vehicles} vehicles were commanded by nobody")]
@@ -146,6 +121,31 @@ pub enum LockstepError {
         /// What is wrong.
         fault: PoolError,
     },
+}
+
+/// A state to be answered.
+#[derive(Debug)]
+enum InHand<F> {
+    /// As it came.
+    Frame(F),
+    /// Handed over.
+    Handed(FrameHeader, Vec<VehicleState>),
+}
+
+impl<F: Frame<VehicleState>> InHand<F> {
+    fn header(&self) -> &FrameHeader {
+        match self {
+            InHand::Frame(frame) => frame.header(),
+            InHand::Handed(header, _) => header,
+        }
+    }
+
+    fn records(&self) -> &[VehicleState] {
+        match self {
+            InHand::Frame(frame) => frame.records(),
+            InHand::Handed(_, records) => records,
+        }
+    }
 }
 
 /// The sender a header names, for messages.

@@ -1,63 +1,115 @@
 //! The world's side of a step: publish the state, collect the commands, integrate.
 
-use super::{Awaited, Identity, LockstepError, Progress, mask_of, sender};
+use super::refusals::{Claim, Refusals};
+use super::{
+    Awaited, Handover, Identity, Ledger, LockstepError, Progress, Refusal, RefusedFrames, mask_of, sender,
+};
+use crate::scenario::share::zones_of;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use crate::world::World;
-use ipc_schemas::{ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, Role, VehicleCommand, VehicleState};
+use ipc_schemas::{
+    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault, Role, VehicleCommand, VehicleState,
+};
 
 /// The world's ends of the services.
 #[derive(Debug)]
-pub struct WorldPorts<S, C, M> {
+pub struct WorldPorts<S, C, M, A> {
     /// State frames to controllers, every step.
     pub state: S,
     /// State frames to each coordinator process, only of the steps it acts in.
     pub coordinator_states: Vec<C>,
     /// Commands from controllers.
     pub command: M,
+    /// Coordination, as controllers get it. With it the world keeps a [`Ledger`]; without, nobody can be
+    /// replaced.
+    pub coordination: Option<A>,
+}
+
+/// A place among the processes of a role.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Seat {
+    /// How often it has been taken anew.
+    pub generation: u32,
+    /// Who has it, where that is known; frames from others are refused then.
+    pub process_id: Option<u32>,
+    /// The sending end that has proved to be that process's.
+    origin: Option<u128>,
+}
+
+impl Seat {
+    /// A place taken for the `generation`th time.
+    pub fn new(generation: u32, process_id: u32) -> Seat {
+        Seat { generation, process_id: Some(process_id), origin: None }
+    }
 }
 
 /// Drives a [`World`] through the lockstep.
 #[derive(Debug)]
-pub struct WorldDriver<S, C, M> {
+pub struct WorldDriver<S, C, M, A>
+where
+    M: Inbox<VehicleCommand>,
+    A: Inbox<Assignment>,
+{
     world: World,
-    ports: WorldPorts<S, C, M>,
+    ports: WorldPorts<S, C, M, A>,
     identity: Identity,
-    controllers: u32,
-    /// Generation of each controller process.
-    controller_generations: Vec<u32>,
+    controllers: Vec<Seat>,
+    coordinators: Vec<Seat>,
+    ledger: Option<Ledger<M::Frame>>,
+    refusals: Refusals,
+    /// Refused frames, held for a while so that their senders are passed over in favour of others.
+    detained: (Vec<M::Frame>, Vec<A::Frame>),
+    /// Whoever has sent something it should not have in this step, in its own name.
+    suspect: Option<(Role, u16)>,
+    header: FrameHeader,
     phase: Phase,
-    was_event: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
 enum Phase {
     Publish,
-    Collect { missing: u64 },
+    Collect(Missing),
     Finished,
 }
 
-impl<S, C, M> WorldDriver<S, C, M>
+/// Bit per process whose frame of this step has not come.
+#[derive(Clone, Copy, Debug)]
+struct Missing {
+    commands: u64,
+    coordination: u64,
+}
+
+/// Refused frames looked at in one go; after that whoever waits looks at its clock.
+const REFUSED_AT_ONCE: usize = 16;
+
+impl<S, C, M, A> WorldDriver<S, C, M, A>
 where
     S: Outbox<VehicleState>,
     C: Outbox<VehicleState>,
     M: Inbox<VehicleCommand>,
+    A: Inbox<Assignment>,
 {
     /// A driver at the world's present step.
     pub fn new(
         mut world: World,
-        ports: WorldPorts<S, C, M>,
+        ports: WorldPorts<S, C, M, A>,
         run_id: u64,
         controllers: u32,
-    ) -> WorldDriver<S, C, M> {
+    ) -> WorldDriver<S, C, M, A> {
         world.share_out(controllers);
+        let ledger = ports.coordination.is_some().then(|| Ledger::new(world.scenario(), controllers));
         WorldDriver {
             world,
+            controllers: vec![Seat::default(); controllers as usize],
+            coordinators: vec![Seat::default(); ports.coordinator_states.len()],
             ports,
             identity: Identity { run_id, role: Role::World, index: 0, generation: 0 },
-            controllers,
-            controller_generations: vec![0; controllers as usize],
+            ledger,
+            refusals: Refusals::default(),
+            detained: (Vec::new(), Vec::new()),
+            suspect: None,
+            header: FrameHeader::default(),
             phase: Phase::Publish,
-            was_event: false,
         }
     }
 
@@ -73,7 +125,62 @@ where
 
     /// Whether a coordinator acted in the step published last.
     pub fn was_event(&self) -> bool {
-        self.was_event
+        self.header.coordinators_acting != 0
+    }
+
+    /// What was refused, by sender.
+    pub fn refused(&self) -> Vec<RefusedFrames> {
+        self.refusals.report()
+    }
+
+    /// The number of answers that came too late or twice.
+    pub fn late_frames(&self) -> u64 {
+        self.refusals.late
+    }
+
+    /// Gives a place to a process; frames its predecessor has left are refused from now on.
+    pub fn seat(&mut self, role: Role, index: u32, seat: Seat) {
+        let seats = if role == Role::Coordinator { &mut self.coordinators } else { &mut self.controllers };
+        if let Some(place) = seats.get_mut(index as usize) {
+            *place = seat;
+        }
+    }
+
+    /// Who is waited for and has sent something it should not have in this step: its name and the fault.
+    pub fn suspect(&self) -> Option<(String, &Refusal)> {
+        let (role, index) = self.suspect?;
+        let Phase::Collect(missing) = self.phase else { return None };
+        let mask = if role == Role::Coordinator { missing.coordination } else { missing.commands };
+        let refusal = self.refusals.last_of(role, index).filter(|_| mask >> index & 1 == 1)?;
+        Some((format!("{role} {index}"), refusal))
+    }
+
+    /// What a process needs that takes a place now. `None` when that is not known yet (a controller must
+    /// wait for the coordination of the step), nothing is kept, or the run is over.
+    pub fn handover(&self, role: Role, index: u32) -> Option<Handover> {
+        let ledger = self.ledger.as_ref()?;
+        let mut handover = match role {
+            Role::Coordinator => ledger.to_coordinator(),
+            _ => ledger.to_controller(index as usize),
+        };
+        handover.step = self.world.step();
+        match (self.phase, role) {
+            (Phase::Finished, _) => return None,
+            (Phase::Collect(missing), Role::Controller) if missing.coordination != 0 => return None,
+            (Phase::Collect(_), Role::Controller) => {
+                handover.header = Some(self.header);
+                handover.states = self.world.records().collect();
+            }
+            (Phase::Collect(_), Role::Coordinator) if self.header.coordinators_acting >> index & 1 == 1 => {
+                handover.header = Some(self.header);
+                handover.states = self.world.coordinator_records(index).collect();
+            }
+            _ => {}
+        }
+        if let Phase::Collect(_) = self.phase {
+            handover.events = self.world.coordinators_with_events();
+        }
+        Some(handover)
     }
 
     /// Does what can be done now.
@@ -83,7 +190,7 @@ where
                 self.publish()?;
                 Ok(Progress::Advanced)
             }
-            Phase::Collect { missing } => self.collect(missing),
+            Phase::Collect(missing) => self.collect(missing),
             Phase::Finished => Ok(Progress::Finished),
         }
     }
@@ -91,7 +198,6 @@ where
     fn publish(&mut self) -> Result<(), LockstepError> {
         let finished = self.world.is_finished();
         let masks = self.world.coordinator_masks();
-        self.was_event = masks.acting != 0;
         let step = self.world.step();
         let header = FrameHeader {
             coordinators_acting: masks.acting,
@@ -106,7 +212,7 @@ where
                 let loan = outbox.loan(header, world.coordinator_record_count(index), |slots| {
                     world.coordinator_records(index).for_each(|r| slots.push(r));
                 })?;
-                check_reached("a coordinator's state frame", step, loan.send()?, 1, finished)?;
+                loan.send()?;
             }
         }
         let world = &self.world;
@@ -114,72 +220,208 @@ where
         let loan =
             self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
         self.world.seal(loan.records());
-        check_reached("the state frame", step, loan.send()?, self.controllers, finished)?;
-        self.phase =
-            if finished { Phase::Finished } else { Phase::Collect { missing: mask_of(self.controllers) } };
-        Ok(())
-    }
-
-    fn collect(&mut self, mut missing: u64) -> Result<Progress, LockstepError> {
-        let step = self.world.step();
-        let Some(frame) = self.ports.command.receive()? else {
-            return Ok(Progress::Waiting(Awaited {
-                role: Role::Controller,
-                missing,
-                what: "commands",
-                step,
-            }));
-        };
-        let header = frame.header();
-        let index = header.sender_index;
-        let generation = self.controller_generations.get(usize::from(index)).copied().unwrap_or(0);
-        ExpectedHeader { run_id: self.identity.run_id, role: Role::Controller, index, generation, step }
-            .check(header, frame.records().len())
-            .map_err(|fault| LockstepError::Header { sender: sender(header), fault })?;
-        if u32::from(index) >= self.controllers || missing >> index & 1 == 0 {
-            return Err(LockstepError::Unexpected { sender: sender(header), step });
+        if let Some(ledger) = &mut self.ledger {
+            ledger.begin(loan.records(), masks.acting != 0);
         }
-        self.world.command(u32::from(index), frame.records()).map_err(|fault| LockstepError::Command {
-            step,
-            sender: sender(header),
-            fault,
-        })?;
-        missing &= !(1 << index);
-        if missing == 0 {
-            self.world.advance().map_err(|vehicles| LockstepError::Uncommanded { step, vehicles })?;
-            self.phase = Phase::Publish;
+        // Whoever does not get it has died, and is missed when its answer is.
+        loan.send()?;
+        self.header = FrameHeader { record_count: count as u32, ..header };
+        self.suspect = None;
+        self.phase = if finished {
+            Phase::Finished
         } else {
-            self.phase = Phase::Collect { missing };
-        }
-        Ok(Progress::Advanced)
-    }
-}
-
-/// A frame must reach every participant; at the end of the run one may have gone already.
-fn check_reached(
-    what: &'static str,
-    step: u64,
-    reached: usize,
-    expected: u32,
-    finished: bool,
-) -> Result<(), LockstepError> {
-    let expected = expected as usize;
-    if reached == expected || finished {
+            let coordination = if self.ledger.is_some() { masks.acting } else { 0 };
+            Phase::Collect(Missing { commands: mask_of(self.controllers.len() as u32), coordination })
+        };
         Ok(())
-    } else {
-        Err(LockstepError::LostReceiver { what, step, reached, expected })
+    }
+
+    fn collect(&mut self, mut missing: Missing) -> Result<Progress, LockstepError> {
+        let mut progress = missing.coordination != 0 && self.take_coordination(&mut missing)?;
+        if missing.commands != 0 {
+            progress |= self.take_command(&mut missing)?;
+        }
+        self.phase = Phase::Collect(missing);
+        if missing.commands == 0 && missing.coordination == 0 {
+            self.finish_step()?;
+            return Ok(Progress::Advanced);
+        }
+        Ok(if progress { Progress::Advanced } else { Progress::Waiting(self.awaited(missing)) })
+    }
+
+    /// Whom the world waits for: a coordinator before the controllers that wait for it themselves.
+    fn awaited(&self, missing: Missing) -> Awaited {
+        let step = self.world.step();
+        match missing.coordination {
+            0 => Awaited { role: Role::Controller, missing: missing.commands, what: "commands", step },
+            mask => Awaited { role: Role::Coordinator, missing: mask, what: "coordination", step },
+        }
+    }
+
+    fn finish_step(&mut self) -> Result<(), LockstepError> {
+        let step = self.world.step();
+        self.world.advance().map_err(|vehicles| LockstepError::Uncommanded { step, vehicles })?;
+        if let Some(ledger) = &mut self.ledger {
+            ledger.end();
+        }
+        self.detained.0.clear();
+        self.detained.1.clear();
+        self.phase = Phase::Publish;
+        Ok(())
+    }
+
+    /// Takes a command frame; returns whether one was taken.
+    fn take_command(&mut self, missing: &mut Missing) -> Result<bool, LockstepError> {
+        for _ in 0..REFUSED_AT_ONCE {
+            let Some(frame) = self.ports.command.receive()? else { break };
+            match self.judge_command(&frame, missing.commands) {
+                Ok(index) => {
+                    missing.commands &= !(1 << index);
+                    if let Some(ledger) = &mut self.ledger {
+                        ledger.command(usize::from(index), frame);
+                    }
+                    return Ok(true);
+                }
+                Err(None) => self.refusals.late += 1,
+                Err(Some(refusal)) => {
+                    self.refuse(Role::Controller, frame.header(), frame.origin(), refusal);
+                    self.detained.0.push(frame);
+                }
+            }
+        }
+        self.detained.0.clear();
+        Ok(false)
+    }
+
+    /// Who sent a frame that has been taken; otherwise why it is not, or nothing for one that is merely late.
+    fn judge_command(&mut self, frame: &M::Frame, missing: u64) -> Result<u16, Option<Refusal>> {
+        let header = frame.header();
+        let step = self.world.step();
+        let index = header.sender_index;
+        let seat = self.controllers.get_mut(usize::from(index));
+        let generation = seat.as_ref().map_or(0, |seat| seat.generation);
+        let expected = ExpectedHeader {
+            run_id: self.identity.run_id,
+            role: Role::Controller,
+            index,
+            generation,
+            step,
+        };
+        check_sender(&expected, frame, frame.records().len(), seat, missing, &self.ports.command)?;
+        match self.world.command(u32::from(index), frame.records()) {
+            Ok(()) => Ok(index),
+            Err(fault) => Err(Some(Refusal::Command { step, fault })),
+        }
+    }
+
+    /// Takes a coordination frame; returns whether one was taken.
+    fn take_coordination(&mut self, missing: &mut Missing) -> Result<bool, LockstepError> {
+        for _ in 0..REFUSED_AT_ONCE {
+            let received = match &mut self.ports.coordination {
+                Some(inbox) => inbox.receive()?,
+                None => None,
+            };
+            let Some(frame) = received else { break };
+            match self.judge_coordination(&frame, missing.coordination) {
+                Ok(index) => {
+                    missing.coordination &= !(1 << index);
+                    if let Some(ledger) = &mut self.ledger {
+                        ledger.coordinate(index, frame.records());
+                    }
+                    return Ok(true);
+                }
+                Err(None) => self.refusals.late += 1,
+                Err(Some(refusal)) => {
+                    self.refuse(Role::Coordinator, frame.header(), frame.origin(), refusal);
+                    self.detained.1.push(frame);
+                }
+            }
+        }
+        self.detained.1.clear();
+        Ok(false)
+    }
+
+    fn judge_coordination(&mut self, frame: &A::Frame, missing: u64) -> Result<u16, Option<Refusal>> {
+        let header = frame.header();
+        let step = self.world.step();
+        let index = header.sender_index;
+        let count = self.coordinators.len() as u32;
+        let seat = self.coordinators.get_mut(usize::from(index));
+        let generation = seat.as_ref().map_or(0, |seat| seat.generation);
+        let expected = ExpectedHeader {
+            run_id: self.identity.run_id,
+            role: Role::Coordinator,
+            index,
+            generation,
+            step,
+        };
+        let inbox = self.ports.coordination.as_ref().expect("the frame came from this inbox");
+        check_sender(&expected, frame, frame.records().len(), seat, missing, inbox)?;
+        let own = zones_of(self.world.scenario().network.zones.len() as u32, u32::from(index), count);
+        match frame.records().iter().position(|a| !own.contains(&a.zone)) {
+            None => Ok(index),
+            Some(record) => {
+                let zone = frame.records()[record].zone;
+                Err(Some(Refusal::ForeignZone { step, record, zone }))
+            }
+        }
+    }
+
+    fn refuse(&mut self, role: Role, header: &FrameHeader, origin: u128, refusal: Refusal) {
+        if !matches!(refusal, Refusal::Stranger { .. }) && header.sender_role == role as u16 {
+            self.suspect = Some((role, header.sender_index));
+        }
+        let ports = &self.ports;
+        self.refusals.enter(header, origin, refusal, || match role {
+            Role::Coordinator => ports.coordination.as_ref().and_then(|inbox| inbox.process_of(origin)),
+            _ => ports.command.process_of(origin),
+        });
     }
 }
 
-/// Checks a state frame as its receivers do.
+/// Checks the header of an answer, that its sender has the place it claims, and that it is still asked for.
+/// An answer that is merely late or comes twice is an error without a refusal.
+fn check_sender<R: ipc_schemas::Record, F: Frame<R>, I: Inbox<R>>(
+    expected: &ExpectedHeader,
+    frame: &F,
+    records: usize,
+    seat: Option<&mut Seat>,
+    missing: u64,
+    inbox: &I,
+) -> Result<(), Option<Refusal>> {
+    let header = frame.header();
+    let checked = expected.check(header, records);
+    let late = match &checked {
+        Ok(()) => header.sender_index < 64 && missing >> header.sender_index & 1 == 0,
+        Err(HeaderFault::OldGeneration { .. }) => true,
+        Err(HeaderFault::OtherStep { expected, found }) => found < expected,
+        Err(_) => false,
+    };
+    if let (Err(fault), false) = (checked, late) {
+        return Err(Some(fault.into()));
+    }
+    let Some(seat) = seat else { return Err(Some(Refusal::Unexpected { step: header.step })) };
+    let origin = frame.origin();
+    if let Some(process_id) = seat.process_id.filter(|_| seat.origin != Some(origin)) {
+        match inbox.process_of(origin) {
+            Some(found) if found != process_id => {
+                return Err(Some(Refusal::Stranger { claimed: Claim::of(header), expected: process_id }));
+            }
+            // It has died since; its successor will answer.
+            None => return Err(None),
+            Some(_) => seat.origin = Some(origin),
+        }
+    }
+    if late { Err(None) } else { Ok(()) }
+}
+
+/// Checks a state frame as its receivers do; the step is their business.
 pub(super) fn check_state(
     run_id: u64,
-    step: Option<u64>,
     header: &FrameHeader,
     records: usize,
 ) -> Result<(), LockstepError> {
-    let step = step.unwrap_or(header.step);
-    ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step }
+    ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
         .check(header, records)
         .map_err(|fault| LockstepError::Header { sender: sender(header), fault })
 }

@@ -3,6 +3,8 @@
 use super::peers::is_alive;
 use super::run_spec::plugin_bytes;
 use super::{Peer, Peers, ProcessError, StopFlag, WaitMode};
+use crate::encoding;
+use crate::lockstep::{Handover, Seat};
 use crate::scenario::{Drivers, Scenario, decode, scenario_hash};
 use crate::transport::TransportError;
 use crate::transport::iox::{AttachDesk, AttachLine, RunName, RunSpace, SpaceError};
@@ -11,7 +13,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Time between two looks for an answer.
-const LOOK: Duration = Duration::from_millis(2);
+const LOOK: Duration = Duration::from_millis(1);
 /// Time after which an unanswered request is repeated.
 const REPEAT: Duration = Duration::from_millis(100);
 
@@ -84,13 +86,30 @@ impl Attachment {
         Ok(Attachment { reply, scenario, line, request, run: run.clone(), joining })
     }
 
-    /// Tells the world that all ends of the services are open. After this the run may begin.
-    pub fn ready(&self, stop: &StopFlag) -> Result<(), ProcessError> {
-        let request = AttachRequest { phase: frames::ATTACH_READY, index: self.reply.index, ..self.request };
+    /// Tells the world that all ends of the services are open. After this the run may begin; if it has
+    /// begun already, what this process needs to go on with it comes back.
+    pub fn ready(&self, stop: &StopFlag) -> Result<Option<Handover>, ProcessError> {
+        self.ask(frames::ATTACH_READY, stop)
+    }
+
+    /// Asks for what is needed to go on, after the run has gone on without this process.
+    pub fn catch_up(&self, stop: &StopFlag) -> Result<Option<Handover>, ProcessError> {
+        self.ask(frames::ATTACH_RESTORE, stop)
+    }
+
+    fn ask(&self, phase: u32, stop: &StopFlag) -> Result<Option<Handover>, ProcessError> {
+        let request = AttachRequest { phase, index: self.reply.index, ..self.request };
         let seconds = self.joining.timeout.as_secs_f64();
         let no_world = || ProcessError::NoWorld { run: self.run.to_string(), seconds };
         let deadline = Instant::now() + self.joining.timeout;
-        exchange(&self.line, request, deadline, stop, &no_world).map(|_| ())
+        // What earlier requests may still have brought is of the past.
+        while self.line.next_reply()?.is_some() {}
+        let (reply, bytes) = exchange(&self.line, request, deadline, stop, &no_world)?;
+        if reply.status != frames::ATTACH_ACCEPTED {
+            let reason = String::from_utf8_lossy(&bytes).into_owned();
+            return Err(ProcessError::Refused { run: self.run.to_string(), role: self.joining.role, reason });
+        }
+        if bytes.is_empty() { Ok(None) } else { Ok(Some(encoding::decode(&bytes)?)) }
     }
 
     /// The world as a peer.
@@ -156,6 +175,7 @@ fn refusal(request: &AttachRequest, reply: &AttachReply, plugins: &str) -> Strin
             format!("all places are taken; the run has {c} coordinator and {k} controller processes")
         }
         frames::ATTACH_BAD_ROLE => format!("it asked for role {}, which nobody has", request.role),
+        frames::ATTACH_UNDER_WAY => "the run is under way and nobody is missing in it".to_owned(),
         frames::ATTACH_NO_CONTROLLER if plugins.is_empty() => {
             "the scenario declares no controllers; add a [[controllers]] table".to_owned()
         }
@@ -174,25 +194,54 @@ pub(super) struct Reception {
     scenario: Vec<u8>,
     scenario_hash: u64,
     waiting: u32,
-    coordinators: Vec<Option<Seat>>,
-    controllers: Vec<Option<Seat>>,
+    coordinators: Vec<Place>,
+    controllers: Vec<Place>,
     /// Number of seats of the built-in pool, which come first.
     pool: usize,
     /// Name hash, and the bytes behind the reply, of each plug-in.
     plugins: Vec<(u64, Vec<u8>)>,
     plugin_names: String,
-    /// What a plug-in that joins is told: 0 and 0, but for a restarted one.
-    pub(super) generation: u32,
-    pub(super) first_step: u64,
+    /// The step a newcomer begins with, once the run is under way.
+    pub(super) under_way: Option<u64>,
+    /// Requests that cannot be answered yet.
+    pending: Vec<AttachRequest>,
     /// Why somebody was refused last.
     pub(super) last_refusal: Option<String>,
 }
 
+/// A place among the processes of a role.
+#[derive(Clone, Copy, Debug, Default)]
+struct Place {
+    occupant: Option<Occupant>,
+    /// How often it has been taken anew since the run began.
+    generation: u32,
+}
+
 #[derive(Clone, Copy, Debug)]
-struct Seat {
+struct Occupant {
     instance: u64,
     process_id: u32,
     ready: bool,
+}
+
+impl Place {
+    fn is_free(&self) -> bool {
+        self.occupant.is_none_or(|o| !is_alive(o.process_id))
+    }
+
+    fn is_of(&self, instance: u64) -> bool {
+        self.occupant.is_some_and(|o| o.instance == instance)
+    }
+}
+
+/// What the world does about a request, as [`Reception::serve`] is told by its caller.
+pub(super) enum Readiness {
+    /// There is nothing to be handed over: the run has not begun.
+    Begin,
+    /// Not now; the answer will be asked for again.
+    Later,
+    /// What the process needs.
+    Now(Box<Handover>),
 }
 
 impl Reception {
@@ -214,62 +263,93 @@ impl Reception {
             desk: space.create_attach_desk((coordinators + controllers) as usize, longest)?,
             pool: drivers.pool() as usize,
             plugins,
-            generation: 0,
-            first_step: 0,
+            under_way: None,
+            pending: Vec::new(),
             last_refusal: None,
             plugin_names: scenario.plugins.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", "),
             run_id,
             scenario_hash: scenario_hash(scenario),
             scenario: bytes,
             waiting: wait.code(),
-            coordinators: vec![None; coordinators as usize],
-            controllers: vec![None; controllers as usize],
+            coordinators: vec![Place::default(); coordinators as usize],
+            controllers: vec![Place::default(); controllers as usize],
         })
     }
 
-    /// Answers what has come.
-    pub(super) fn serve(&mut self) -> Result<(), TransportError> {
+    /// Answers what has come. `hand_over` is asked, for a process of the run that is ready or has fallen
+    /// behind, what it needs.
+    pub(super) fn serve(
+        &mut self,
+        hand_over: &mut dyn FnMut(Role, u32, Seat) -> Readiness,
+    ) -> Result<(), TransportError> {
+        for request in std::mem::take(&mut self.pending) {
+            self.answer(request, hand_over)?;
+        }
         while let Some(request) = self.desk.next_request()? {
-            let (status, index) = self.judge(&request);
-            let reply = AttachReply {
-                instance: request.instance,
-                run_id: self.run_id,
-                schema_hash: schema_hash(),
-                scenario_hash: self.scenario_hash,
-                first_step: self.first_step,
-                status,
-                world_process_id: std::process::id(),
-                generation: self.generation,
-                index,
-                coordinators: self.coordinators.len() as u32,
-                controllers: self.controllers.len() as u32,
-                waiting: self.waiting,
-                reserved: 0,
-            };
-            let reason;
-            let behind = if status != frames::ATTACH_ACCEPTED {
-                reason = refusal(&request, &reply, &self.plugin_names);
-                self.last_refusal = Some(reason.clone());
-                reason.as_bytes()
-            } else if request.controller == frames::BUILT_IN {
-                &self.scenario[..]
-            } else {
-                &self.plugins[index as usize - self.pool].1
-            };
-            self.desk.reply(reply, behind)?;
+            self.pending.retain(|p| p.instance != request.instance);
+            self.answer(request, hand_over)?;
         }
         Ok(())
     }
 
-    fn judge(&mut self, request: &AttachRequest) -> (u32, u32) {
+    fn answer(
+        &mut self,
+        request: AttachRequest,
+        hand_over: &mut dyn FnMut(Role, u32, Seat) -> Readiness,
+    ) -> Result<(), TransportError> {
+        let (status, index, generation) = self.judge(&request);
+        let reply = AttachReply {
+            instance: request.instance,
+            run_id: self.run_id,
+            schema_hash: schema_hash(),
+            scenario_hash: self.scenario_hash,
+            first_step: self.under_way.unwrap_or(0),
+            status,
+            world_process_id: std::process::id(),
+            generation,
+            index,
+            coordinators: self.coordinators.len() as u32,
+            controllers: self.controllers.len() as u32,
+            waiting: self.waiting,
+            reserved: 0,
+        };
+        if status != frames::ATTACH_ACCEPTED {
+            let reason = refusal(&request, &reply, &self.plugin_names);
+            self.desk.reply(reply, reason.as_bytes())?;
+            self.last_refusal = Some(reason);
+            return Ok(());
+        }
+        let role = Role::from_code(request.role).filter(|_| request.phase != frames::ATTACH_JOIN);
+        let seat = Seat::new(generation, request.process_id);
+        let handed = role.map_or(Readiness::Begin, |role| hand_over(role, index, seat));
+        if request.controller != frames::BUILT_IN {
+            return self.desk.reply(reply, &self.plugins[index as usize - self.pool].1);
+        }
+        match handed {
+            _ if request.phase == frames::ATTACH_JOIN => self.desk.reply(reply, &self.scenario),
+            Readiness::Begin => self.desk.reply(reply, &[]),
+            Readiness::Later => {
+                self.pending.push(request);
+                Ok(())
+            }
+            Readiness::Now(handover) => {
+                let mut bytes = Vec::new();
+                encoding::encode_onto(&mut bytes, &handover);
+                self.desk.reply(reply, &bytes)
+            }
+        }
+    }
+
+    /// Status, index and generation for a request.
+    fn judge(&mut self, request: &AttachRequest) -> (u32, u32, u32) {
         if request.schema_hash != schema_hash() {
-            return (frames::ATTACH_OTHER_SCHEMA, 0);
+            return (frames::ATTACH_OTHER_SCHEMA, 0, 0);
         }
         if request.scenario_hash != frames::ANY_SCENARIO && request.scenario_hash != self.scenario_hash {
-            return (frames::ATTACH_OTHER_SCENARIO, 0);
+            return (frames::ATTACH_OTHER_SCENARIO, 0, 0);
         }
         let mut first = 0;
-        let seats = match Role::from_code(request.role) {
+        let places = match Role::from_code(request.role) {
             Some(Role::Coordinator) => &mut self.coordinators[..],
             Some(Role::Controller) if request.controller == frames::BUILT_IN => {
                 &mut self.controllers[..self.pool]
@@ -277,36 +357,44 @@ impl Reception {
             Some(Role::Controller) => {
                 let Some(plugin) = self.plugins.iter().position(|(hash, _)| *hash == request.controller)
                 else {
-                    return (frames::ATTACH_NO_CONTROLLER, 0);
+                    return (frames::ATTACH_NO_CONTROLLER, 0, 0);
                 };
                 first = self.pool + plugin;
                 &mut self.controllers[first..=first]
             }
-            _ => return (frames::ATTACH_BAD_ROLE, 0),
+            _ => return (frames::ATTACH_BAD_ROLE, 0, 0),
         };
-        let own = seats.iter().position(|s| s.is_some_and(|s| s.instance == request.instance));
-        let free = |seat: &Option<Seat>| seat.is_none_or(|s| !is_alive(s.process_id));
+        let own = places.iter().position(|p| p.is_of(request.instance));
+        let is_newcomer = own.is_none() && request.phase == frames::ATTACH_JOIN;
         let place = own.or_else(|| match request.wanted_index {
-            frames::ANY_INDEX => seats.iter().position(free),
+            _ if !is_newcomer => None,
+            frames::ANY_INDEX => places.iter().position(Place::is_free),
             wanted => {
                 let wanted = usize::from(wanted).wrapping_sub(first);
-                seats.get(wanted).is_some_and(free).then_some(wanted)
+                places.get(wanted).is_some_and(Place::is_free).then_some(wanted)
             }
         });
-        let Some(place) = place else { return (frames::ATTACH_NO_ROOM, 0) };
-        let ready = request.phase == frames::ATTACH_READY && own.is_some();
-        seats[place] = Some(Seat {
-            instance: request.instance,
-            process_id: request.process_id,
-            ready: ready || seats[place].is_some_and(|s| s.instance == request.instance && s.ready),
-        });
-        (frames::ATTACH_ACCEPTED, (first + place) as u32)
+        let Some(at) = place else {
+            let status =
+                if self.under_way.is_some() { frames::ATTACH_UNDER_WAY } else { frames::ATTACH_NO_ROOM };
+            return (status, 0, 0);
+        };
+        let place = &mut places[at];
+        if is_newcomer {
+            let AttachRequest { instance, process_id, .. } = *request;
+            place.occupant = Some(Occupant { instance, process_id, ready: false });
+            place.generation += u32::from(self.under_way.is_some());
+        }
+        if let Some(occupant) = place.occupant.as_mut().filter(|_| request.phase != frames::ATTACH_JOIN) {
+            occupant.ready = true;
+        }
+        (frames::ATTACH_ACCEPTED, (first + at) as u32, place.generation)
     }
 
     /// The first participant that is not ready, or died since: its role and index.
     pub(super) fn first_missing(&self) -> Option<(Role, usize)> {
-        let there = |seat: &Seat| seat.ready && is_alive(seat.process_id);
-        let missing = |seats: &[Option<Seat>]| seats.iter().position(|s| !s.as_ref().is_some_and(there));
+        let there = |place: &Place| place.occupant.is_some_and(|o| o.ready && is_alive(o.process_id));
+        let missing = |places: &[Place]| places.iter().position(|p| !there(p));
         missing(&self.coordinators)
             .map(|i| (Role::Coordinator, i))
             .or_else(|| missing(&self.controllers).map(|i| (Role::Controller, i)))
@@ -323,22 +411,30 @@ impl Reception {
 
     /// Whether a controller is ready.
     pub(super) fn is_ready(&self, controller: usize) -> bool {
-        self.controllers[controller].is_some_and(|s| s.ready)
+        self.controllers[controller].occupant.is_some_and(|o| o.ready)
     }
 
     /// Frees the place of a controller that has been ended.
     pub(super) fn vacate(&mut self, controller: usize) {
-        self.controllers[controller] = None;
+        self.controllers[controller].occupant = None;
+    }
+
+    /// Whether a controller is a plug-in.
+    pub(super) fn is_plugin(&self, controller: usize) -> bool {
+        controller >= self.pool
+    }
+
+    /// The generation of a controller.
+    pub(super) fn generation(&self, controller: usize) -> u32 {
+        self.controllers[controller].generation
     }
 
     /// All participants.
     pub(super) fn peers(&self) -> Peers {
-        let peers = |role, seats: &[Option<Seat>]| {
-            let seats: Vec<_> = seats.iter().flatten().copied().collect();
-            seats.into_iter().zip(0..).map(move |(seat, index)| Peer {
-                role,
-                index,
-                process_id: seat.process_id,
+        let peers = |role, places: &[Place]| {
+            let processes: Vec<_> = places.iter().map(|p| p.occupant.map(|o| o.process_id)).collect();
+            (0..).zip(processes).filter_map(move |(index, process_id)| {
+                Some(Peer { role, index, process_id: process_id? })
             })
         };
         Peers(

@@ -18,7 +18,7 @@ pub use run_spec::plugin_bytes;
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
-    LatencyUs, Outcome, Percentiles, WorldOptions, check_cores, new_histogram, run_in_process, run_world,
+    LatencyUs, Outcome, Percentiles, Replacement, WorldOptions, check_cores, new_histogram, run_in_process, run_world,
 };
 
 use crate::lockstep::{Awaited, LockstepError};
@@ -98,18 +98,24 @@ pub enum ProcessError {
         /// How long.
         seconds: f64,
     },
-    /// A process of the run has ended or died.
-    #[error("{who} (process {process_id}) is gone; {consequence}")]
-    PeerGone {
+    /// A participant sent what it should not have and nothing better since.
+    #[error("{who} sent a frame that cannot be taken, and no good one since: {fault}")]
+    Faulty {
         /// Who.
         who: String,
-        /// Its process id.
-        process_id: u32,
+        /// What was wrong with the frame.
+        fault: crate::lockstep::Refusal,
+    },
+    /// A process of the run has ended or died.
+    #[error("{peer} (process {}) is gone; {consequence}", .peer.process_id)]
+    PeerGone {
+        /// Who.
+        peer: Peer,
         /// What that meant here.
         consequence: String,
     },
-    /// The scenario that came with the attach reply cannot be read.
-    #[error("the scenario sent by the world cannot be read: {0}")]
+    /// The scenario or the handover that came with an attach reply cannot be read.
+    #[error("what the world sent cannot be read: {0}")]
     Scenario(#[from] DecodeError),
     /// Signal handlers could not be installed.
     #[error("cannot handle signals: {0}")]

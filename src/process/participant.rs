@@ -1,13 +1,20 @@
 //! The coordinator and controller processes.
 
 use super::world::{controller_ropes, coordinator_rope, expected_vehicles};
+use super::wait::Participant;
 use super::{Attachment, Joining, Patience, Placement, ProcessError, StopFlag, WaitMode, Waiter, place};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
-use crate::lockstep::{ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity};
+use crate::lockstep::{
+    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Handover, Identity,
+    LockstepError, Progress,
+};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::transport::iox::{RunName, RunSpace};
-use ipc_schemas::{self as frames, AttachReply, Role};
+use crate::transport::{Inbox, Outbox};
+use ipc_schemas::{
+    self as frames, Assignment, AttachReply, Role, VehicleCommand, VehicleState, ZoneSummary,
+};
 use std::time::Duration;
 
 /// How long a coordinator waits for the next event. Events may be far apart in a paced run; a world that
@@ -53,11 +60,14 @@ pub fn run_coordinator(
     };
     let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
     let identity = identity(&attachment.reply, Role::Coordinator);
-    let mut driver = CoordinatorDriver::new(role, ports, identity, controllers);
-    attachment.ready(stop)?;
+    let mut driver = CoordinatorDriver::new(role, ports, identity);
+    if let Some(handover) = attachment.ready(stop)? {
+        driver.take_over(handover);
+    }
     let hot_processes = 1 + controllers as usize;
     let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
-    Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world()).drive(|| driver.advance())
+    Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world())
+        .drive(&mut driver, || attachment.catch_up(stop))
 }
 
 /// Runs a controller process with the built-in law to the end of the run.
@@ -90,9 +100,43 @@ pub fn run_controller(
     let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
     let identity = identity(&attachment.reply, Role::Controller);
     let mut driver = ControllerDriver::new(role, ports, identity, first_step);
-    attachment.ready(stop)?;
+    if let Some(handover) = attachment.ready(stop)? {
+        driver.take_over(handover);
+    }
     let patience = Patience::of(wait, Role::Controller, 1 + controllers as usize, peer_timeout);
-    Waiter::new(patience, bell, stop.clone(), attachment.world()).drive(|| driver.advance())
+    Waiter::new(patience, bell, stop.clone(), attachment.world())
+        .drive(&mut driver, || attachment.catch_up(stop))
+}
+
+impl<S, N, O, A> Participant for CoordinatorDriver<S, N, O, A>
+where
+    S: Inbox<VehicleState>,
+    N: Inbox<ZoneSummary>,
+    O: Outbox<ZoneSummary>,
+    A: Outbox<Assignment>,
+{
+    fn advance(&mut self) -> Result<Progress, LockstepError> {
+        self.advance()
+    }
+
+    fn take_over(&mut self, handover: Handover) {
+        self.take_over(handover);
+    }
+}
+
+impl<S, A, C> Participant for ControllerDriver<S, A, C>
+where
+    S: Inbox<VehicleState>,
+    A: Inbox<Assignment>,
+    C: Outbox<VehicleCommand>,
+{
+    fn advance(&mut self) -> Result<Progress, LockstepError> {
+        self.advance()
+    }
+
+    fn take_over(&mut self, handover: Handover) {
+        self.take_over(handover);
+    }
 }
 
 fn identity(reply: &AttachReply, role: Role) -> Identity {

@@ -5,7 +5,7 @@
 //! brakes to a stop, a restart in mid-run, and the end of the run. A bad frame is noted under the rule it
 //! breaks and replaced, so that one fault does not hide the others.
 
-use super::attach::Reception;
+use super::attach::{Readiness, Reception};
 use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
@@ -274,7 +274,7 @@ impl Kit<'_> {
     fn admit(&mut self, rule: Rule) -> Result<bool, ProcessError> {
         let deadline = Instant::now() + JOIN;
         while !self.reception.is_ready(INDEX as usize) {
-            self.reception.serve()?;
+            self.reception.serve(&mut |_, _, _| Readiness::Begin)?;
             if let Some(reason) = self.reception.last_refusal.take() {
                 let rule = if reason.contains("schema") { Rule::Schema } else { rule };
                 self.breach(rule, format!("attach request refused: {reason}"));
@@ -304,8 +304,7 @@ impl Kit<'_> {
                 // What it had sent, if anything, is of the past.
                 while self.commands.receive()?.is_some() {}
                 self.reception.vacate(INDEX as usize);
-                self.reception.generation += 1;
-                self.reception.first_step = step;
+                self.reception.under_way = Some(step);
                 self.start()?;
                 if !self.admit(Rule::Restart)? {
                     return Ok(());
@@ -417,7 +416,7 @@ impl Kit<'_> {
                 format!("took {:.1} ms, allowed are {:.1}", ms(took), ms(self.deadline)),
             );
         }
-        let generation = self.reception.generation;
+        let generation = self.reception.generation(INDEX as usize);
         let index = INDEX as u16;
         let expected =
             ExpectedHeader { run_id: self.run_id, role: Role::Controller, index, generation, step };

@@ -1,7 +1,7 @@
 //! How a process waits for a frame: busily at first, then asleep, never for ever.
 
-use super::{Peer, Peers, ProcessError, StopFlag};
-use crate::lockstep::{Awaited, LockstepError, Progress};
+use super::{Peers, ProcessError, StopFlag};
+use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
 use crate::transport::iox::Bell;
 use ipc_schemas::{Role, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
 use std::time::{Duration, Instant};
@@ -87,8 +87,12 @@ impl Patience {
     }
 }
 
-fn peer_gone(peer: Peer, consequence: String) -> ProcessError {
-    ProcessError::PeerGone { who: peer.to_string(), process_id: peer.process_id, consequence }
+/// A driver of a participant.
+pub trait Participant {
+    /// Does what can be done now.
+    fn advance(&mut self) -> Result<Progress, LockstepError>;
+    /// Goes on from what another has left, or from where the run is now.
+    fn take_over(&mut self, handover: Handover);
 }
 
 /// Waits for one frame after another.
@@ -109,7 +113,7 @@ const POLLS_PER_LOOK: u32 = 64;
 /// How long a peer that has left the services may take to end.
 const LEAVING: Duration = Duration::from_millis(200);
 /// How often the peers are checked during a long wait.
-const PEER_CHECK: Duration = Duration::from_millis(50);
+const PEER_CHECK: Duration = Duration::from_millis(10);
 
 impl Waiter {
     /// A waiter that gives up when asked to stop, when a peer has died, or when patience runs out.
@@ -167,22 +171,40 @@ impl Waiter {
         if self.waited >= self.peers_checked + PEER_CHECK {
             self.peers_checked = self.waited;
             if let Some(peer) = self.peers.first_gone() {
-                return Err(peer_gone(peer, format!("this one was waiting for {awaited}")));
+                let consequence = format!("this one was waiting for {awaited}");
+                return Err(ProcessError::PeerGone { peer, consequence });
             }
         }
         Ok(())
     }
 
-    /// Drives a state machine to the end of the run.
+    /// Whom to look after from now on.
+    pub fn set_peers(&mut self, peers: Peers) {
+        self.peers = peers;
+    }
+
+    /// How long the present wait has lasted, as of the last look at the clock.
+    pub fn waited(&self) -> Duration {
+        self.waited
+    }
+
+    /// Drives a participant to the end of the run; `catch_up` gets what it needs when it has fallen behind.
     pub fn drive(
         &mut self,
-        mut advance: impl FnMut() -> Result<Progress, LockstepError>,
+        driver: &mut impl Participant,
+        catch_up: impl Fn() -> Result<Option<Handover>, ProcessError>,
     ) -> Result<(), ProcessError> {
         loop {
-            match advance().map_err(|error| self.explain(error))? {
+            match driver.advance().map_err(|error| self.explain(error))? {
                 Progress::Finished => return Ok(()),
                 Progress::Advanced => self.reset(),
                 Progress::Waiting(awaited) => self.wait(awaited)?,
+                Progress::Behind => {
+                    if let Some(handover) = catch_up()? {
+                        driver.take_over(handover);
+                    }
+                    self.reset();
+                }
             }
         }
     }
@@ -193,7 +215,7 @@ impl Waiter {
         let deadline = Instant::now() + LEAVING;
         loop {
             if let Some(peer) = self.peers.first_gone() {
-                return peer_gone(peer, error.to_string());
+                return ProcessError::PeerGone { peer, consequence: error.to_string() };
             }
             if Instant::now() >= deadline {
                 return error.into();

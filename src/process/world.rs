@@ -1,11 +1,12 @@
 //! The world process.
 
-use super::attach::Reception;
-use super::{Patience, ProcessError, StopFlag, WaitMode, Waiter};
+use super::attach::{Readiness, Reception};
+use super::{Patience, Peer, Peers, ProcessError, StopFlag, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
-use crate::lockstep::{Progress, WorldDriver, WorldPorts};
+use crate::lockstep::{Awaited, Progress, RefusedFrames, Seat, WorldDriver, WorldPorts};
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
+use crate::transport::{Inbox, Outbox};
 use crate::transport::iox::{BellRope, BellService, RunName, RunSpace, Service, ServiceLimits, SpaceError};
 use crate::world::{World, WorldSummary};
 use hdrhistogram::Histogram;
@@ -29,6 +30,9 @@ pub struct WorldOptions {
     pub peer_timeout: Duration,
     /// How the processes of the run wait.
     pub wait: WaitMode,
+    /// Whether the run waits, as long as for a frame, for somebody to take the place of a coordinator or
+    /// controller that has died.
+    pub replace: bool,
 }
 
 /// Percentiles of the time a step takes, from the state's publication to the end of integration, us.
@@ -59,6 +63,25 @@ pub struct Outcome {
     pub event_ns: Percentiles,
     /// Peak resident memory of the process, bytes (0 where it cannot be known).
     pub peak_rss_bytes: u64,
+    /// Processes that took the place of others.
+    pub replacements: Vec<Replacement>,
+    /// Frames that were not taken, by sender.
+    pub refused: Vec<RefusedFrames>,
+    /// Answers that came too late or twice.
+    pub late_frames: u64,
+}
+
+/// A process that took the place of one that had died.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Replacement {
+    /// Role and index.
+    pub participant: String,
+    /// The place's generation since.
+    pub generation: u32,
+    /// Step during which it came.
+    pub step: u64,
+    /// How long that step took, ms.
+    pub step_ms: f64,
 }
 
 /// Peak resident memory of this process, bytes.
@@ -134,7 +157,8 @@ impl StepMeter {
         }
     }
 
-    fn step_done(&mut self, was_event: bool) {
+    /// Returns how long the step took, ns.
+    fn step_done(&mut self, was_event: bool) -> u64 {
         let now = Instant::now();
         let ns = (now - self.step_start).as_nanos() as u64;
         // The histograms resize themselves; only an absurd latency could not be recorded.
@@ -143,9 +167,10 @@ impl StepMeter {
             let _ = if was_event { &mut self.event_ns } else { &mut self.steady_ns }.record(ns);
         }
         self.step_start = now;
+        ns
     }
 
-    fn outcome(&self, world: &World) -> Outcome {
+    fn outcome(&self, world: &World, history: History) -> Outcome {
         let us = |ns: u64| ns as f64 / 1e3;
         Outcome {
             world: world.summary(),
@@ -159,8 +184,19 @@ impl StepMeter {
             steady_ns: Percentiles::of(&self.steady_ns),
             event_ns: Percentiles::of(&self.event_ns),
             peak_rss_bytes: peak_rss_bytes(),
+            replacements: history.replacements,
+            refused: history.refused,
+            late_frames: history.late_frames,
         }
     }
+}
+
+/// What happened to the participants of a run.
+#[derive(Debug, Default)]
+struct History {
+    replacements: Vec<Replacement>,
+    refused: Vec<RefusedFrames>,
+    late_frames: u64,
 }
 
 /// Refuses to spin with more processes than cores.
@@ -191,7 +227,8 @@ pub fn run_world(
         other => other.into(),
     };
     // The desk last: once it exists, everything else does.
-    let services = Services::create(&space, scenario, coordinators, controllers).map_err(active)?;
+    let services =
+        Services::create(&space, scenario, (coordinators, controllers), options.replace).map_err(active)?;
     let _bells = create_bells(&space, wait, coordinators, controllers)?;
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
@@ -206,19 +243,31 @@ pub fn run_world(
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
     let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
+    for Peer { role, index, process_id } in reception.peers().0 {
+        driver.seat(role, index, Seat::new(0, process_id));
+    }
+    let mut house = House { reception, replace: options.replace, gone: None, arrived: Vec::new() };
+    let mut history = History::default();
     let mut meter = StepMeter::start();
     let mut step = 0;
     loop {
         match driver.advance().map_err(|error| waiter.explain(error))? {
-            Progress::Finished => return Ok(meter.outcome(driver.world())),
-            Progress::Waiting(awaited) => waiter.wait(awaited)?,
+            Progress::Finished => {
+                history.refused = driver.refused();
+                history.late_frames = driver.late_frames();
+                return Ok(meter.outcome(driver.world(), history));
+            }
+            Progress::Waiting(awaited) => house.wait(&mut driver, &mut waiter, awaited)?,
+            Progress::Behind => unreachable!("the world is where the run is"),
             Progress::Advanced => {
                 waiter.reset();
                 if driver.world().step() != step {
                     step = driver.world().step();
-                    meter.step_done(driver.was_event());
+                    let ns = meter.step_done(driver.was_event());
+                    history.replacements.extend(house.step_done(ns));
                     if step.is_multiple_of(STEPS_PER_LOOK) {
                         progress(driver.world());
+                        house.attend(&mut driver, &mut waiter)?;
                         if stop.is_set() {
                             return Err(ProcessError::Interrupted { step: Some(step) });
                         }
@@ -226,6 +275,104 @@ pub fn run_world(
                 }
             }
         }
+    }
+}
+
+/// A participant that has sent a bad frame may take this long to send a good one.
+const SECOND_CHANCE: Duration = Duration::from_secs(1);
+/// Newcomers are seen to when a wait takes longer than this.
+const ATTEND_AFTER: Duration = Duration::from_millis(1);
+
+/// Who is in the run, and who comes and goes.
+#[derive(Debug)]
+struct House {
+    reception: Reception,
+    replace: bool,
+    /// Who has died last and was not replaced yet.
+    gone: Option<Peer>,
+    /// Who has come since the last step ended.
+    arrived: Vec<(Peer, u32)>,
+}
+
+impl House {
+    /// Waits a little; sees to newcomers when it takes long.
+    fn wait<S, C, M, A>(
+        &mut self,
+        driver: &mut WorldDriver<S, C, M, A>,
+        waiter: &mut Waiter,
+        awaited: Awaited,
+    ) -> Result<(), ProcessError>
+    where
+        S: Outbox<VehicleState>,
+        C: Outbox<VehicleState>,
+        M: Inbox<VehicleCommand>,
+        A: Inbox<Assignment>,
+    {
+        if waiter.waited() >= ATTEND_AFTER {
+            self.attend(driver, waiter)?;
+            if waiter.waited() >= SECOND_CHANCE
+                && let Some((who, fault)) = driver.suspect()
+            {
+                return Err(ProcessError::Faulty { who, fault: fault.clone() });
+            }
+        }
+        match (waiter.wait(awaited), self.gone) {
+            (Err(ProcessError::PeerGone { peer, .. }), _) if self.may_be_replaced(peer) => {
+                self.gone = Some(peer);
+                let others = self.reception.peers().0.into_iter().filter(|p| *p != peer);
+                waiter.set_peers(Peers(others.collect()));
+                Ok(())
+            }
+            (Err(ProcessError::Timeout { awaited, seconds }), Some(peer)) => {
+                let consequence = format!("nobody took its place within {seconds} s of waiting for {awaited}");
+                Err(ProcessError::PeerGone { peer, consequence })
+            }
+            (result, _) => result,
+        }
+    }
+
+    fn may_be_replaced(&self, peer: Peer) -> bool {
+        let is_plugin = peer.role == Role::Controller && self.reception.is_plugin(peer.index as usize);
+        self.replace && !is_plugin
+    }
+
+    /// Sees to whoever has come.
+    fn attend<S, C, M, A>(
+        &mut self,
+        driver: &mut WorldDriver<S, C, M, A>,
+        waiter: &mut Waiter,
+    ) -> Result<(), ProcessError>
+    where
+        S: Outbox<VehicleState>,
+        C: Outbox<VehicleState>,
+        M: Inbox<VehicleCommand>,
+        A: Inbox<Assignment>,
+    {
+        let House { reception, arrived, gone, .. } = self;
+        reception.under_way = Some(driver.world().step());
+        let before = arrived.len();
+        reception.serve(&mut |role, index, seat| {
+            driver.seat(role, index, seat);
+            let Some(handover) = driver.handover(role, index) else { return Readiness::Later };
+            if let Some(process_id) = seat.process_id {
+                arrived.push((Peer { role, index, process_id }, seat.generation));
+            }
+            Readiness::Now(Box::new(handover))
+        })?;
+        if arrived.len() > before {
+            *gone = None;
+            waiter.set_peers(reception.peers());
+        }
+        Ok(())
+    }
+
+    /// The replacements of a step that took so long.
+    fn step_done(&mut self, ns: u64) -> impl Iterator<Item = Replacement> + '_ {
+        let step = self.reception.under_way.unwrap_or(0);
+        let step_ms = ns as f64 / 1e6;
+        self.arrived.drain(..).filter(|(_, generation)| *generation > 0).map(move |(peer, generation)| {
+            Replacement { participant: peer.to_string(), generation, step, step_ms }
+        })
     }
 }
 
@@ -249,7 +396,7 @@ pub fn run_in_process(
             }
         }
     }
-    Ok(meter.outcome(run.world()))
+    Ok(meter.outcome(run.world(), History::default()))
 }
 
 /// Waits until all participants are ready.
@@ -260,7 +407,7 @@ fn receive_all(
 ) -> Result<(), ProcessError> {
     let deadline = Instant::now() + options.attach_timeout;
     loop {
-        reception.serve()?;
+        reception.serve(&mut |_, _, _| Readiness::Begin)?;
         let Some((role, index)) = reception.first_missing() else { return Ok(()) };
         if stop.is_set() {
             return Err(ProcessError::Interrupted { step: None });
@@ -277,13 +424,18 @@ fn receive_all(
     }
 }
 
+/// Room for sending ends that belong to nobody in the run: what they send is counted and refused.
+const STRANGERS: usize = 2;
+
 /// All frame services of a run, created by its world and kept open by it.
 #[derive(Debug)]
 struct Services {
     state: Service<VehicleState>,
     coordinator_states: Vec<Service<VehicleState>>,
     command: Service<VehicleCommand>,
-    _coordination: Service<Assignment>,
+    coordination: Service<Assignment>,
+    /// Whether the world listens to coordination too.
+    keeps: bool,
     _summaries: Vec<Service<ZoneSummary>>,
     controllers: u32,
 }
@@ -292,11 +444,13 @@ impl Services {
     fn create(
         space: &RunSpace,
         scenario: &Scenario,
-        coordinators: u32,
-        controllers: u32,
+        (coordinators, controllers): (u32, u32),
+        keeps: bool,
     ) -> Result<Services, SpaceError> {
         let (m, n) = (coordinators as usize, controllers as usize);
-        let limits = |publishers, subscribers| ServiceLimits { publishers, subscribers, nodes: 1 + m + n };
+        // Strangers may try; they shall not keep anybody out who belongs here.
+        let nodes = 1 + m + n + STRANGERS;
+        let limits = |publishers, subscribers| ServiceLimits { publishers, subscribers, nodes };
         let masks = neighbour_coordinators(&scenario.network, coordinators);
         Ok(Services {
             controllers,
@@ -307,8 +461,10 @@ impl Services {
                     space.create(&name, limits(1, 1))
                 })
                 .collect::<Result<_, _>>()?,
-            command: space.create(frames::SERVICE_COMMAND, limits(n, 1))?,
-            _coordination: space.create(frames::SERVICE_COORDINATION, limits(m, n))?,
+            command: space.create(frames::SERVICE_COMMAND, limits(n + STRANGERS, 1))?,
+            coordination: space
+                .create(frames::SERVICE_COORDINATION, limits(m + STRANGERS, n + usize::from(keeps)))?,
+            keeps,
             _summaries: (0..m)
                 .map(|i| {
                     let name = format!("{}{i}", frames::SERVICE_SUMMARY_PREFIX);
@@ -329,6 +485,7 @@ impl Services {
             crate::transport::iox::IoxOutbox<VehicleState>,
             crate::transport::iox::IoxOutbox<VehicleState>,
             crate::transport::iox::IoxInbox<VehicleCommand>,
+            crate::transport::iox::IoxInbox<Assignment>,
         >,
         SpaceError,
     > {
@@ -342,6 +499,7 @@ impl Services {
                 .map(|(s, i)| Ok(s.outbox(expected)?.ringing(coordinator_rope(space, wait, i))))
                 .collect::<Result<_, SpaceError>>()?,
             command: self.command.inbox()?,
+            coordination: if self.keeps { Some(self.coordination.inbox()?) } else { None },
         })
     }
 }

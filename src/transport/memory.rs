@@ -25,17 +25,16 @@ struct Sent<R> {
 }
 
 /// A service within one thread. Make its inboxes first; outboxes send to those that exist by then.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct MemoryService<R> {
-    name: &'static str,
     queues: Vec<Queue<R>>,
     senders: Cell<usize>,
 }
 
 impl<R: Record> MemoryService<R> {
     /// A service without receivers.
-    pub fn new(name: &'static str) -> MemoryService<R> {
-        MemoryService { name, queues: Vec::new(), senders: Cell::new(0) }
+    pub fn new() -> MemoryService<R> {
+        MemoryService { queues: Vec::new(), senders: Cell::new(0) }
     }
 
     /// A new receiver.
@@ -48,14 +47,13 @@ impl<R: Record> MemoryService<R> {
     /// A sender to all present receivers.
     pub fn outbox(&self) -> MemoryOutbox<R> {
         let sender = self.senders.replace(self.senders.get() + 1);
-        MemoryOutbox { name: self.name, sender, queues: self.queues.clone(), buffers: Vec::new() }
+        MemoryOutbox { sender, queues: self.queues.clone(), buffers: Vec::new() }
     }
 }
 
 /// The sending end.
 #[derive(Debug)]
 pub struct MemoryOutbox<R> {
-    name: &'static str,
     /// Number among the outboxes of the service.
     sender: usize,
     queues: Vec<Queue<R>>,
@@ -98,15 +96,16 @@ impl<R: Record> Loan<R> for MemoryLoan<'_, R> {
 
     fn send(self) -> Result<usize, TransportError> {
         let sender = self.outbox.sender;
-        let untaken = |queue: &Queue<R>| queue.borrow().iter().filter(|s| s.sender == sender).count();
-        if self.outbox.queues.iter().any(|q| untaken(q) >= QUEUE_LIMIT) {
-            return Err(TransportError::ReceiverFull { service: self.outbox.name.to_owned() });
-        }
+        let mut reached = 0;
         for queue in &self.outbox.queues {
-            queue.borrow_mut().push_back(Sent { sender, buffer: self.buffer.clone() });
+            let mut queue = queue.borrow_mut();
+            if queue.iter().filter(|s| s.sender == sender).count() < QUEUE_LIMIT {
+                queue.push_back(Sent { sender, buffer: self.buffer.clone() });
+                reached += 1;
+            }
         }
         self.outbox.buffers.push(self.buffer);
-        Ok(self.outbox.queues.len())
+        Ok(reached)
     }
 }
 

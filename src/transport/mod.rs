@@ -33,7 +33,8 @@ pub trait Outbox<R: Record> {
 pub trait Loan<R: Record> {
     /// The records.
     fn records(&self) -> &[R];
-    /// Sends the frame to every receiver and returns their number.
+    /// Sends the frame to every receiver that has room for it, and returns the number of those reached. A
+    /// receiver that has not taken the frames before misses this one: it cannot stall anybody.
     fn send(self) -> Result<usize, TransportError>;
 }
 
@@ -42,8 +43,14 @@ pub trait Inbox<R: Record> {
     /// A received frame.
     type Frame: Frame<R>;
 
-    /// The next frame, if there is one.
+    /// The next frame, if there is one. Frames of one sender come in order; a sender two of whose frames
+    /// are still held is passed over.
     fn receive(&mut self) -> Result<Option<Self::Frame>, TransportError>;
+
+    /// The process behind a frame's [`origin`](Frame::origin), where the transport knows.
+    fn process_of(&self, _origin: u128) -> Option<u32> {
+        None
+    }
 }
 
 /// A received frame, borrowed from the transport until dropped.
@@ -52,6 +59,11 @@ pub trait Frame<R: Record> {
     fn header(&self) -> &FrameHeader;
     /// The records.
     fn records(&self) -> &[R];
+
+    /// What the transport, not the header, says of the sending end: the same for all its frames.
+    fn origin(&self) -> u128 {
+        0
+    }
 }
 
 /// Memory for the records of a frame, filled front to back.
@@ -97,12 +109,6 @@ impl<'a, R: Record> Slots<'a, R> {
 /// Why a frame could not be sent or received.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TransportError {
-    /// A receiver has not taken the frames sent to it before.
-    #[error("{service}: a receiver has not taken the frames sent before")]
-    ReceiverFull {
-        /// Service name.
-        service: String,
-    },
     /// The transport failed.
     #[error("{service}: {reason}")]
     Failed {

@@ -113,6 +113,11 @@ impl World {
         }
     }
 
+    /// The scenario.
+    pub fn scenario(&self) -> &Arc<Scenario> {
+        &self.scenario
+    }
+
     /// The present step.
     pub fn step(&self) -> u64 {
         self.step
@@ -251,6 +256,11 @@ impl World {
             }
         }
         CoordinatorMasks { acting, summarised }
+    }
+
+    /// Coordinator processes that have an event in the present step, one bit each.
+    pub fn coordinators_with_events(&self) -> u64 {
+        self.summarised
     }
 
     /// Integrates one step with the commands taken.

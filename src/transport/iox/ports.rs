@@ -4,11 +4,15 @@ use super::bell::BellRope;
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
-use iceoryx2::port::{LoanError, SendError};
+use iceoryx2::port::{LoanError, ReceiveError};
+use iceoryx2::prelude::CallbackProgression;
 use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::ipc;
+use iceoryx2::service::port_factory::PortFactory as _;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use ipc_schemas::{FrameHeader, Record};
+use std::rc::Rc;
 
 /// The sending end of a service.
 #[derive(Debug)]
@@ -76,9 +80,9 @@ impl<R: Record> Loan<R> for IoxLoan<'_, R> {
 
     fn send(self) -> Result<usize, TransportError> {
         let service = self.service;
-        let reached = self.sample.send().map_err(|error| match error {
-            SendError::UnableToDeliver => TransportError::ReceiverFull { service: service.to_owned() },
-            other => TransportError::Failed { service: service.to_owned(), reason: format!("{other:?}") },
+        let reached = self.sample.send().map_err(|error| TransportError::Failed {
+            service: service.to_owned(),
+            reason: format!("{error:?}"),
         })?;
         self.bells.iter().for_each(BellRope::ring);
         Ok(reached)
@@ -90,11 +94,20 @@ impl<R: Record> Loan<R> for IoxLoan<'_, R> {
 pub struct IoxInbox<R: Record> {
     service: String,
     subscriber: Subscriber<ipc::Service, [R], FrameHeader>,
+    /// Knows the ports of the service.
+    factory: Rc<Factory<R>>,
 }
 
+/// A service as iceoryx2 has it.
+pub(super) type Factory<R> = PortFactory<ipc::Service, [R], FrameHeader>;
+
 impl<R: Record> IoxInbox<R> {
-    pub(super) fn new(service: String, subscriber: Subscriber<ipc::Service, [R], FrameHeader>) -> Self {
-        IoxInbox { service, subscriber }
+    pub(super) fn new(
+        service: String,
+        subscriber: Subscriber<ipc::Service, [R], FrameHeader>,
+        factory: Rc<Factory<R>>,
+    ) -> Self {
+        IoxInbox { service, subscriber, factory }
     }
 }
 
@@ -104,10 +117,24 @@ impl<R: Record> Inbox<R> for IoxInbox<R> {
     fn receive(&mut self) -> Result<Option<IoxFrame<R>>, TransportError> {
         match self.subscriber.receive() {
             Ok(sample) => Ok(sample.map(|sample| IoxFrame { sample })),
+            // Nothing but frames of senders of whom enough is held already.
+            Err(ReceiveError::ExceedsMaxBorrows) => Ok(None),
             Err(error) => {
                 Err(TransportError::Failed { service: self.service.clone(), reason: format!("{error:?}") })
             }
         }
+    }
+
+    fn process_of(&self, origin: u128) -> Option<u32> {
+        let mut process = None;
+        self.factory.dynamic_config().list_publishers(|publisher| {
+            if publisher.publisher_id.value() != origin {
+                return CallbackProgression::Continue;
+            }
+            process = publisher.node_id.pid::<ipc::Service>().ok().map(|pid| pid.value() as u32);
+            CallbackProgression::Stop
+        });
+        process
     }
 }
 
@@ -124,5 +151,9 @@ impl<R: Record> Frame<R> for IoxFrame<R> {
 
     fn records(&self) -> &[R] {
         self.sample.payload()
+    }
+
+    fn origin(&self) -> u128 {
+        self.sample.origin().value()
     }
 }

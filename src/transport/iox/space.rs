@@ -3,7 +3,7 @@
 //! A run has a directory of its own and a file-name prefix of its own; both derive from the run's name.
 //! Whoever leaves last removes both, including the one global file iceoryx2 leaves behind.
 
-use super::ports::{IoxInbox, IoxOutbox};
+use super::ports::{Factory, IoxInbox, IoxOutbox};
 use crate::transport::TransportError;
 use iceoryx2::config::Config;
 use iceoryx2::port::BackpressureAction;
@@ -16,9 +16,9 @@ use iceoryx2::prelude::{
 use iceoryx2::sample::Sample;
 use iceoryx2::service::builder::publish_subscribe::{PublishSubscribeCreateError, PublishSubscribeOpenError};
 use iceoryx2::service::ipc;
-use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
 use ipc_schemas::{AttachReply, AttachRequest, FrameHeader, Record, SERVICE_ATTACH, SERVICE_ATTACH_REPLY};
 use std::path::{Path, PathBuf};
+use std::rc::Rc;
 use std::str::FromStr;
 
 /// A valid run name: 1 to 32 characters of `[A-Za-z0-9_-]`.
@@ -101,7 +101,7 @@ pub struct ServiceLimits {
 #[derive(Debug)]
 pub struct Service<R: Record> {
     name: String,
-    factory: PortFactory<ipc::Service, [R], FrameHeader>,
+    factory: Rc<Factory<R>>,
 }
 
 impl<R: Record> Service<R> {
@@ -113,8 +113,8 @@ impl<R: Record> Service<R> {
             .max_loaned_samples(1)
             .initial_max_slice_len(expected_records.max(1))
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            // In lockstep a full receiver is a fault, not something to wait for.
-            .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
+            // Nobody waits for a receiver that does not take its frames.
+            .set_backpressure_handler(|_| BackpressureAction::DiscardData)
             .create()
             .map_err(|e| failed(&format!("create a publisher of {}", self.name), &e))?;
         Ok(IoxOutbox::new(self.name.clone(), publisher))
@@ -127,7 +127,7 @@ impl<R: Record> Service<R> {
             .subscriber_builder()
             .create()
             .map_err(|e| failed(&format!("create a subscriber of {}", self.name), &e))?;
-        Ok(IoxInbox::new(self.name.clone(), subscriber))
+        Ok(IoxInbox::new(self.name.clone(), subscriber, self.factory.clone()))
     }
 }
 
@@ -143,6 +143,9 @@ pub struct RunSpace {
 
 /// Frames in flight per connection: in lockstep one is being read while the next arrives.
 const BUFFER: usize = 2;
+/// Frames of one sender a receiver may hold: the world keeps those of this step and of the one before, and
+/// holds on to two bad ones so that others get their turn.
+const BORROWED: usize = 4;
 
 impl RunSpace {
     /// Enters the space of a run, creating it when nobody else has.
@@ -177,13 +180,13 @@ impl RunSpace {
             .enable_safe_overflow(false)
             .history_size(0)
             .subscriber_max_buffer_size(BUFFER)
-            .subscriber_max_borrowed_samples(BUFFER)
+            .subscriber_max_borrowed_samples(BORROWED)
             .max_publishers(limits.publishers)
             .max_subscribers(limits.subscribers)
             .max_nodes(limits.nodes)
             .create()
             .map_err(|e| create_error(name, e))?;
-        Ok(Service { name: name.to_owned(), factory })
+        Ok(Service { name: name.to_owned(), factory: Rc::new(factory) })
     }
 
     /// Opens a service the world has created.
@@ -195,7 +198,7 @@ impl RunSpace {
             .user_header::<FrameHeader>()
             .open()
             .map_err(|e| open_error(name, e))?;
-        Ok(Service { name: name.to_owned(), factory })
+        Ok(Service { name: name.to_owned(), factory: Rc::new(factory) })
     }
 
     /// Opens the world's side of attaching.
@@ -235,6 +238,8 @@ impl RunSpace {
             replies: replies
                 .publisher_builder()
                 .initial_max_slice_len(reply_bytes)
+                // What is handed over to a replacement may be longer than the scenario.
+                .allocation_strategy(AllocationStrategy::PowerOfTwo)
                 .create()
                 .map_err(|e| failed("publish attach replies", &e))?,
         })

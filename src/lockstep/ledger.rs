@@ -1,0 +1,200 @@
+//! What the world keeps of everybody's frames, so that a process may be replaced.
+//!
+//! A participant's memory is in frames: a controller's in its last commands, a coordinator's in the
+//! assignments in force and in what zones last told each other. The ledger has all of these as they were
+//! *before* the present step, and the frames of the present step beside them. A step is over only when
+//! every coordinator that acts in it and every controller has answered. So whoever takes a place starts
+//! with the present step and does all of it, whatever its predecessor had done of it; what was already
+//! there arrives twice and is the same.
+
+use crate::coordination::{Audience, is_event};
+use crate::scenario::Scenario;
+use crate::transport::Frame;
+use ipc_schemas::{Assignment, FrameHeader, VehicleCommand, VehicleState, ZoneSummary};
+use serde::{Deserialize, Serialize};
+
+/// What a participant needs in order to go on from the present step.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Handover {
+    /// Step it begins with.
+    pub step: u64,
+    /// Header of the state frame of that step, when it has been sent already.
+    pub header: Option<FrameHeader>,
+    /// The records of that frame.
+    pub states: Vec<VehicleState>,
+    /// Coordination of that step that has been sent already, by coordinator process.
+    pub coordination: Vec<(u16, Vec<Assignment>)>,
+    /// To a controller: its commands of the step before.
+    pub commands: Vec<VehicleCommand>,
+    /// To a controller: assignments in force before that step, by zone.
+    pub in_force: Vec<Assignment>,
+    /// To a coordinator: the last summaries its zones acted on.
+    pub downstream: Vec<ZoneSummary>,
+    /// To a coordinator: the summaries sent in the step before.
+    pub due: Vec<ZoneSummary>,
+    /// To a coordinator: the summaries of that step, for the next one.
+    pub fresh: Vec<ZoneSummary>,
+    /// To a coordinator: bit per coordinator process that has an event in that step, and so sends summaries.
+    pub events: u64,
+}
+
+/// One controller's commands of one step.
+#[derive(Debug)]
+enum Commands<F> {
+    /// None yet.
+    Missing,
+    /// As they came.
+    Frame(F),
+    /// Put in by the world.
+    Own(Vec<VehicleCommand>),
+}
+
+impl<F: Frame<VehicleCommand>> Commands<F> {
+    fn records(&self) -> &[VehicleCommand] {
+        match self {
+            Commands::Missing => &[],
+            Commands::Frame(frame) => frame.records(),
+            Commands::Own(records) => records,
+        }
+    }
+}
+
+/// The frames of the present step, and what was in force before it.
+#[derive(Debug)]
+pub struct Ledger<F> {
+    audiences: Vec<Audience>,
+    in_force: Vec<Vec<Assignment>>,
+    /// Per zone, the last summary of its downstream neighbour it acted on.
+    downstream: Vec<Option<ZoneSummary>>,
+    downstream_zone: Vec<Option<u32>>,
+    due: Vec<ZoneSummary>,
+    fresh: Vec<ZoneSummary>,
+    coordination: Vec<(u16, Vec<Assignment>)>,
+    /// Buffers of `coordination` to be used again.
+    spare: Vec<Vec<Assignment>>,
+    before: Vec<Commands<F>>,
+    now: Vec<Commands<F>>,
+    /// Whether the present step has begun.
+    has_begun: bool,
+}
+
+impl<F: Frame<VehicleCommand>> Ledger<F> {
+    /// The ledger of a run that has not begun.
+    pub fn new(scenario: &Scenario, controllers: u32) -> Ledger<F> {
+        let network = &scenario.network;
+        let zones = network.zones.len();
+        let none = || (0..controllers).map(|_| Commands::Missing).collect();
+        Ledger {
+            audiences: (0..zones as u32).map(|zone| Audience::of(network, zone)).collect(),
+            in_force: vec![Vec::new(); zones],
+            downstream: vec![None; zones],
+            downstream_zone: (0..zones as u32).map(|zone| network.downstream(zone)).collect(),
+            due: Vec::new(),
+            fresh: Vec::new(),
+            coordination: Vec::new(),
+            spare: Vec::new(),
+            before: none(),
+            now: none(),
+            has_begun: false,
+        }
+    }
+
+    /// A step begins with this state.
+    pub fn begin(&mut self, states: &[VehicleState], is_event_step: bool) {
+        self.has_begun = true;
+        for summary in self.due.drain(..) {
+            let zone = summary.to_zone as usize;
+            if self.downstream_zone[zone] == Some(summary.from_zone) {
+                self.downstream[zone] = Some(summary);
+            }
+        }
+        std::mem::swap(&mut self.due, &mut self.fresh);
+        if is_event_step {
+            for slice in states.chunk_by(|a, b| a.zone == b.zone) {
+                let zone = slice[0].zone;
+                if let Some(audience) = self.audiences.get(zone as usize).filter(|_| is_event(slice)) {
+                    self.fresh.extend(audience.summaries(zone, slice));
+                }
+            }
+        }
+    }
+
+    /// A coordinator's frame of this step.
+    pub fn coordinate(&mut self, coordinator: u16, assignments: &[Assignment]) {
+        let mut copy = self.spare.pop().unwrap_or_default();
+        copy.clear();
+        copy.extend_from_slice(assignments);
+        let at = self.coordination.partition_point(|(other, _)| *other < coordinator);
+        self.coordination.insert(at, (coordinator, copy));
+    }
+
+    /// A controller's frame of this step.
+    pub fn command(&mut self, controller: usize, frame: F) {
+        self.now[controller] = Commands::Frame(frame);
+    }
+
+    /// Commands the world has put in for a controller in this step.
+    pub fn substitute(&mut self, controller: usize, commands: Vec<VehicleCommand>) {
+        self.now[controller] = Commands::Own(commands);
+    }
+
+    /// The step is over: what was sent in it is in force.
+    pub fn end(&mut self) {
+        self.has_begun = false;
+        for (_, assignments) in &self.coordination {
+            for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
+                let Some(zone) = self.in_force.get_mut(group[0].zone as usize) else { continue };
+                zone.clear();
+                zone.extend_from_slice(group);
+            }
+        }
+        self.spare.extend(self.coordination.drain(..).map(|(_, assignments)| assignments));
+        for (before, now) in self.before.iter_mut().zip(&mut self.now) {
+            *before = std::mem::replace(now, Commands::Missing);
+        }
+    }
+
+    /// A controller's commands of the present step, and whether the world put them in.
+    pub fn commands(&self, controller: usize) -> (&[VehicleCommand], bool) {
+        let commands = &self.now[controller];
+        (commands.records(), matches!(commands, Commands::Own(_)))
+    }
+
+    /// A controller's commands of the step before.
+    pub fn commands_before(&self, controller: usize) -> &[VehicleCommand] {
+        self.before[controller].records()
+    }
+
+    /// The coordination of the present step so far, by coordinator process.
+    pub fn coordination(&self) -> &[(u16, Vec<Assignment>)] {
+        &self.coordination
+    }
+
+    /// The summaries of the present step: what every zone with an event tells each neighbour.
+    pub fn summaries(&self) -> &[ZoneSummary] {
+        &self.fresh
+    }
+
+    /// What a controller needs for the present step, besides its state.
+    pub fn to_controller(&self, controller: usize) -> Handover {
+        Handover {
+            coordination: self.coordination.clone(),
+            commands: self.commands_before(controller).to_vec(),
+            in_force: self.in_force.concat(),
+            ..Handover::default()
+        }
+    }
+
+    /// What a coordinator needs for the present step, besides its state.
+    pub fn to_coordinator(&self) -> Handover {
+        let downstream = self.downstream.iter().flatten().copied();
+        if self.has_begun {
+            let (due, fresh) = (self.due.clone(), self.fresh.clone());
+            return Handover { downstream: downstream.collect(), due, fresh, ..Handover::default() };
+        }
+        // What was due in the last step has been acted on, and what was fresh is due.
+        let acted_on = self.due.iter().filter(|s| self.downstream_zone[s.to_zone as usize] == Some(s.from_zone));
+        let downstream = downstream.chain(acted_on.copied()).collect();
+        Handover { downstream, due: self.fresh.clone(), ..Handover::default() }
+    }
+}

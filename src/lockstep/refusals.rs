@@ -1,0 +1,155 @@
+//! Frames that are not taken: counted and attributed, and no reason to end anything.
+
+use crate::control::pool::PoolError;
+use crate::world::CommandFault;
+use ipc_schemas::{FrameHeader, HeaderFault, Role};
+use serde::{Deserialize, Serialize};
+
+/// Why a frame was not taken.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// The header is not what the protocol asks for.
+    #[error("{0}")]
+    Header(#[from] HeaderFault),
+    /// The frame was sent by another process than the one that has this place.
+    #[error("it claims to come from {claimed}, which is process {expected}")]
+    Stranger {
+        /// Whom the header names.
+        claimed: Claim,
+        /// The process that has that place.
+        expected: u32,
+    },
+    /// A second frame of the same step, or one nobody asked for in this step.
+    #[error("step {step}: nobody asked for it")]
+    Unexpected {
+        /// Step in its header.
+        step: u64,
+    },
+    /// A controller's commands do not fit the state.
+    #[error("step {step}, {fault}")]
+    Command {
+        /// Step.
+        step: u64,
+        /// What is wrong.
+        fault: CommandFault,
+    },
+    /// A coordinator's assignments do not fit the state.
+    #[error("step {step}, {fault}")]
+    Coordination {
+        /// Step.
+        step: u64,
+        /// What is wrong.
+        fault: PoolError,
+    },
+    /// A coordinator's assignments name zones that are not its own.
+    #[error("step {step}, record {record}, field zone: {zone} is not a zone of this coordinator that acts")]
+    ForeignZone {
+        /// Step.
+        step: u64,
+        /// Place in the frame.
+        record: usize,
+        /// Zone named.
+        zone: u32,
+    },
+}
+
+/// The sender a header names; the codes come off the wire and may name nobody.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Claim {
+    role: u16,
+    index: u16,
+}
+
+impl Claim {
+    /// Of a header.
+    pub fn of(header: &FrameHeader) -> Claim {
+        Claim { role: header.sender_role, index: header.sender_index }
+    }
+}
+
+impl std::fmt::Display for Claim {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match Role::from_code(self.role) {
+            Some(Role::World) => f.write_str("the world"),
+            Some(role) => write!(f, "{role} {}", self.index),
+            None => write!(f, "a sender of unknown role {}", self.role),
+        }
+    }
+}
+
+/// What was refused of one sender.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RefusedFrames {
+    /// Who sent them: the role and index claimed, and the process where it is known.
+    pub sender: String,
+    /// Their number.
+    pub frames: u64,
+    /// What was wrong with the last one.
+    pub last: String,
+}
+
+/// Accounts are kept for this many senders; the rest share one.
+const MAX_ACCOUNTS: usize = 64;
+
+#[derive(Debug)]
+struct Account {
+    origin: u128,
+    claim: Claim,
+    process_id: Option<u32>,
+    frames: u64,
+    last: Refusal,
+}
+
+/// What one receiver has refused, by sender.
+#[derive(Debug, Default)]
+pub(super) struct Refusals {
+    accounts: Vec<Account>,
+    /// Answers that came after the run had gone on, or twice: what a participant that was slow, or has been
+    /// replaced, leaves behind.
+    pub late: u64,
+}
+
+impl Refusals {
+    /// Enters a frame; `process` is asked once per sender.
+    pub fn enter(
+        &mut self,
+        header: &FrameHeader,
+        origin: u128,
+        refusal: Refusal,
+        process: impl FnOnce() -> Option<u32>,
+    ) {
+        let claim = Claim::of(header);
+        let full = self.accounts.len() >= MAX_ACCOUNTS;
+        let known = self.accounts.iter_mut().find(|a| a.origin == origin && a.claim == claim);
+        let account = match known {
+            Some(account) => account,
+            None if full => self.accounts.last_mut().expect("there are accounts"),
+            None => {
+                let process_id = process();
+                let account = Account { origin, claim, process_id, frames: 0, last: refusal.clone() };
+                self.accounts.push(account);
+                self.accounts.last_mut().expect("one was added")
+            }
+        };
+        account.frames += 1;
+        account.last = refusal;
+    }
+
+    /// The last refusal of a sender that claimed this place.
+    pub fn last_of(&self, role: Role, index: u16) -> Option<&Refusal> {
+        let claim = Claim { role: role as u16, index };
+        self.accounts.iter().rev().find(|a| a.claim == claim).map(|a| &a.last)
+    }
+
+    /// All of it.
+    pub fn report(&self) -> Vec<RefusedFrames> {
+        let sender = |a: &Account| match a.process_id {
+            Some(id) => format!("{} (process {id})", a.claim),
+            None => a.claim.to_string(),
+        };
+        self.accounts
+            .iter()
+            .map(|a| RefusedFrames { sender: sender(a), frames: a.frames, last: a.last.to_string() })
+            .collect()
+    }
+}

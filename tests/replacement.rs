@@ -1,0 +1,190 @@
+//! A coordinator or controller that is killed is replaced, and the result does not change by a bit.
+
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
+mod common;
+
+use common::{Ended, Process, Site, children, send, ticks, wait_until};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rustix::process::Signal;
+use std::time::Duration;
+
+/// Steady traffic through two zones for 400 000 steps: long enough to be disturbed in the middle of.
+const LONG: [&str; 11] = [
+    "varying-demand",
+    "--set",
+    "end.time_s=40000",
+    "--set",
+    "roads.main1.demand.rates=[{until_s=40000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge1.demand.rates=[{until_s=40000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge2.demand.rates=[{until_s=40000.0,vehicles_per_hour=300.0}]",
+    "--json",
+    "-",
+];
+
+fn undisturbed() -> String {
+    Site::new("u").start("cz", &[&LONG[..], &["--in-process"]].concat()).ended().hash()
+}
+
+/// A supervised run that steps.
+fn begin(site: &Site, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
+    let supervisor = site.start("cz", &[&LONG, arguments].concat());
+    let mut parts = Vec::new();
+    wait_until("the supervisor to have started the parts", || {
+        parts = children(supervisor.id())
+            .into_iter()
+            .filter_map(|(id, line)| line.get(1).filter(|part| *part != "run").map(|p| (p.clone(), id)))
+            .collect();
+        parts.len() == processes
+    });
+    let world = parts.iter().find(|(part, _)| part == "world").unwrap().1;
+    wait_until("the world to be stepping", || ticks(world) >= 5);
+    (supervisor, parts)
+}
+
+/// Kills the first process of each kind named after a while, and returns how the run ended.
+fn disturb(
+    site: &Site,
+    arguments: &[&str],
+    processes: usize,
+    victims: &[&str],
+    after: Duration,
+) -> (Ended, usize) {
+    let (supervisor, parts) = begin(site, arguments, processes);
+    std::thread::sleep(after);
+    let mut killed = 0;
+    for victim in victims {
+        let (_, id) = parts.iter().find(|(part, _)| part == victim).unwrap();
+        // The run may be over; then there is nobody to be killed.
+        killed += usize::from(common::is_alive(*id));
+        send_if_alive(*id);
+    }
+    (supervisor.ended(), killed)
+}
+
+fn send_if_alive(id: u32) {
+    if common::is_alive(id) {
+        let _ = rustix::process::kill_process(
+            rustix::process::Pid::from_raw(id as i32).unwrap(),
+            Signal::KILL,
+        );
+    }
+}
+
+/// Kills each kind of participant, and both, that many times, at random instants of a run each; prints how
+/// long the steps took in which the successors came.
+fn matrix(times: usize, shares: &[&str], processes: usize) {
+    let expected = undisturbed();
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    for victims in [&["ctrl"][..], &["coord"], &["ctrl", "coord"]] {
+        let (mut replaced, mut step_ms) = (0, Vec::new());
+        for _ in 0..times {
+            let site = Site::new("kill");
+            let after = Duration::from_millis(rng.random_range(0..700));
+            let (ended, killed) = disturb(&site, shares, processes, victims, after);
+            let summary = ended.json();
+            assert_eq!(common::hash(&summary), expected, "{ended:?}");
+            let replacements = summary["replacements"].as_array().unwrap();
+            assert!(replacements.len() <= killed, "{ended:?}");
+            assert!(replacements.iter().all(|r| r["generation"] == 1), "{ended:?}");
+            replaced += replacements.len();
+            step_ms.extend(replacements.iter().map(|r| r["step_ms"].as_f64().unwrap()));
+            site.assert_clean();
+        }
+        // Some may have been killed at the very end.
+        assert!(replaced * 2 > times * victims.len(), "only {replaced} replacements of {victims:?}");
+        step_ms.sort_by(f64::total_cmp);
+        let at = |q: f64| step_ms[((step_ms.len() - 1) as f64 * q) as usize];
+        println!(
+            "{victims:?} {shares:?}: {times} runs, {replaced} replacements, the same hash; recovery in ms: least {:.1}, \
+             median {:.1}, p90 {:.1}, greatest {:.1}",
+            at(0.0),
+            at(0.5),
+            at(0.9),
+            at(1.0)
+        );
+    }
+}
+
+#[test]
+fn whoever_is_killed_is_replaced_without_a_trace_in_the_result() {
+    matrix(3, &[], 3);
+    matrix(2, &["--ctrl-procs", "2", "--coord-procs", "2"], 5);
+}
+
+#[test]
+#[ignore = "takes minutes: the kill matrix of 100 runs each"]
+fn kill_matrix() {
+    matrix(100, &[], 3);
+    matrix(100, &["--ctrl-procs", "2", "--coord-procs", "2"], 5);
+}
+
+#[test]
+fn a_part_killed_again_and_again_is_replaced_each_time() {
+    let (site, expected) = (Site::new("again"), undisturbed());
+    let (supervisor, _) = begin(&site, &[], 3);
+    let mut killed = Vec::new();
+    wait_until("five controllers to have been killed", || {
+        let parts = children(supervisor.id());
+        let controller = parts.iter().find(|(id, line)| {
+            line.get(1).is_some_and(|p| p == "ctrl") && !killed.contains(id) && ticks(*id) >= 2
+        });
+        if let Some((id, _)) = controller {
+            send(*id, Signal::KILL);
+            killed.push(*id);
+        }
+        killed.len() == 5
+    });
+    let summary = supervisor.ended().json();
+    assert_eq!(common::hash(&summary), expected);
+    assert_eq!(summary["replacements"].as_array().unwrap().len(), 5);
+    site.assert_clean();
+}
+
+#[test]
+fn parts_started_by_hand_leave_and_rejoin() {
+    let expected = undisturbed();
+    let site = Site::new("rejoin");
+    let world = site.start("cz-world", &LONG);
+    let coordinator = site.start("cz-coord", &[]);
+    let controller = site.start("cz-ctrl", &[]);
+    wait_until("the world to be stepping", || ticks(world.id()) >= 5);
+    controller.signal(Signal::INT);
+    controller.ended().expect(130, &["interrupted at step"]);
+    coordinator.signal(Signal::KILL);
+    let successors = [site.start("cz-coord", &[]), site.start("cz-ctrl", &[])];
+    let summary = world.ended().json();
+    assert_eq!(common::hash(&summary), expected);
+    assert_eq!(summary["replacements"].as_array().unwrap().len(), 2);
+    successors.map(|part| part.ended().expect(0, &[]));
+    assert!(coordinator.ended().was_killed_by(Signal::KILL));
+    site.assert_clean();
+}
+
+#[test]
+fn nobody_joins_a_run_in_which_nobody_is_missing() {
+    let site = Site::new("late");
+    let (supervisor, _) = begin(&site, &[], 3);
+    let late = site.start("cz-ctrl", &[]).ended();
+    late.expect(1, &["refused", "under way", "nobody is missing"]);
+    assert_eq!(supervisor.ended().hash(), undisturbed());
+    site.assert_clean();
+}
+
+#[test]
+fn a_world_nobody_comes_back_to_gives_up_and_says_for_whom_it_waited() {
+    let site = Site::new("lost");
+    let world = site.start("cz-world", &[&LONG[..], &["--peer-timeout", "1"]].concat());
+    let coordinator = site.start("cz-coord", &[]);
+    let controller = site.start("cz-ctrl", &[]);
+    wait_until("the world to be stepping", || ticks(world.id()) >= 5);
+    let dead = format!("controller 0 (process {}) is gone", controller.id());
+    controller.signal(Signal::KILL);
+    world.ended().expect(1, &[&dead, "nobody took its place within 1 s", "commands of step"]);
+    coordinator.ended().expect(1, &["the world", "gone"]);
+    drop(controller);
+    site.assert_clean();
+}
