@@ -10,17 +10,17 @@ use rand_chacha::ChaCha8Rng;
 use rustix::process::Signal;
 use std::time::Duration;
 
-/// Steady traffic through two zones for 400 000 steps: long enough to be disturbed in the middle of.
+/// Steady traffic through two zones for 100 000 steps: long enough to be disturbed in the middle of.
 const LONG: [&str; 11] = [
     "varying-demand",
     "--set",
-    "end.time_s=40000",
+    "end.time_s=10000",
     "--set",
-    "roads.main1.demand.rates=[{until_s=40000.0,vehicles_per_hour=300.0}]",
+    "roads.main1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
     "--set",
-    "roads.merge1.demand.rates=[{until_s=40000.0,vehicles_per_hour=300.0}]",
+    "roads.merge1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
     "--set",
-    "roads.merge2.demand.rates=[{until_s=40000.0,vehicles_per_hour=300.0}]",
+    "roads.merge2.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
     "--json",
     "-",
 ];
@@ -83,7 +83,7 @@ fn matrix(times: usize, shares: &[&str], processes: usize) {
         let (mut replaced, mut step_ms) = (0, Vec::new());
         for _ in 0..times {
             let site = Site::new("kill");
-            let after = Duration::from_millis(rng.random_range(0..700));
+            let after = Duration::from_millis(rng.random_range(0..150));
             let (ended, killed) = disturb(&site, shares, processes, victims, after);
             let summary = ended.json();
             assert_eq!(common::hash(&summary), expected, "{ended:?}");
