@@ -17,11 +17,13 @@ pub use error::{Place, ScenarioError};
 pub use overrides::Override;
 
 use super::{Network, Road, Scenario, ShieldMode, embedded};
-use demand::{DemandReader, MAX_TIME_S, TraceBase};
+use demand::{DemandReader, TraceBase};
+pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
 use std::collections::BTreeMap;
 use std::path::Path;
 use table::Table;
+pub(super) use topology::MAX_COUNT;
 
 /// The scenario that runs when none is named.
 pub const DEFAULT_SCENARIO: &str = "two-merges";

@@ -29,13 +29,15 @@ struct Sent<R> {
 pub struct MemoryService<R> {
     name: &'static str,
     queues: Vec<Queue<R>>,
+    /// Those who only look on.
+    taps: Vec<Queue<R>>,
     senders: Cell<usize>,
 }
 
 impl<R: Record> MemoryService<R> {
     /// A service without receivers.
     pub fn new(name: &'static str) -> MemoryService<R> {
-        MemoryService { name, queues: Vec::new(), senders: Cell::new(0) }
+        MemoryService { name, queues: Vec::new(), taps: Vec::new(), senders: Cell::new(0) }
     }
 
     /// A new receiver.
@@ -45,10 +47,19 @@ impl<R: Record> MemoryService<R> {
         MemoryInbox { queue }
     }
 
+    /// A receiver that only looks on: it is not counted among those a frame reaches, and may leave as many
+    /// frames untaken as it likes.
+    pub fn tap(&mut self) -> MemoryInbox<R> {
+        let queue = Queue::default();
+        self.taps.push(queue.clone());
+        MemoryInbox { queue }
+    }
+
     /// A sender to all present receivers.
     pub fn outbox(&self) -> MemoryOutbox<R> {
         let sender = self.senders.replace(self.senders.get() + 1);
-        MemoryOutbox { name: self.name, sender, queues: self.queues.clone(), buffers: Vec::new() }
+        let (queues, taps) = (self.queues.clone(), self.taps.clone());
+        MemoryOutbox { name: self.name, sender, queues, taps, buffers: Vec::new() }
     }
 }
 
@@ -59,6 +70,7 @@ pub struct MemoryOutbox<R> {
     /// Number among the outboxes of the service.
     sender: usize,
     queues: Vec<Queue<R>>,
+    taps: Vec<Queue<R>>,
     /// Buffers sent before; those nobody reads any more are used again.
     buffers: Vec<Rc<Buffer<R>>>,
 }
@@ -102,7 +114,7 @@ impl<R: Record> Loan<R> for MemoryLoan<'_, R> {
         if self.outbox.queues.iter().any(|q| untaken(q) >= QUEUE_LIMIT) {
             return Err(TransportError::ReceiverFull { service: self.outbox.name.to_owned() });
         }
-        for queue in &self.outbox.queues {
+        for queue in self.outbox.queues.iter().chain(&self.outbox.taps) {
             queue.borrow_mut().push_back(Sent { sender, buffer: self.buffer.clone() });
         }
         self.outbox.buffers.push(self.buffer);

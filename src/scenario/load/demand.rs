@@ -8,9 +8,9 @@ use std::path::PathBuf;
 use std::rc::Rc;
 
 /// Instants above this are refused: step numbers times nanoseconds stay far within 64 bits.
-pub(super) const MAX_TIME_S: f64 = 1e9;
+pub(in crate::scenario) const MAX_TIME_S: f64 = 1e9;
 /// 10 vehicles per second: no lane carries it, and it bounds the work per simulated second.
-const MAX_RATE_PER_HOUR: f64 = 36_000.0;
+pub(in crate::scenario) const MAX_RATE_PER_HOUR: f64 = 36_000.0;
 const HEADER: &str = "time_s,road,speed_mps";
 
 /// Where the traces a scenario names are found.
