@@ -102,7 +102,6 @@ pub trait Record:
     + zerocopy::FromBytes
     + IntoBytes
     + zerocopy::Immutable
-    + zerocopy::KnownLayout
     + 'static
 {
     /// The record's layout.
@@ -127,7 +126,7 @@ macro_rules! record {
         #[derive(
             Clone, Copy, Debug, Default, PartialEq,
             iceoryx2_bb_derive_macros::ZeroCopySend,
-            zerocopy::FromBytes, zerocopy::IntoBytes, zerocopy::Immutable, zerocopy::KnownLayout,
+            zerocopy::FromBytes, zerocopy::IntoBytes, zerocopy::Immutable,
             serde::Serialize, serde::Deserialize,
         )]
         #[type_name($type_name)]

@@ -11,7 +11,7 @@ use ipc_schemas::{
     Assignment, FrameHeader, Record, VehicleCommand, VehicleState, ZoneSummary, bytes_of, records_from,
 };
 use xxhash_rust::xxh3::xxh3_64;
-use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 /// First bytes of a block.
 pub const BLOCK_MAGIC: [u8; 8] = *b"CZstep\0\x01";
@@ -54,7 +54,7 @@ pub struct CommandPart<'a> {
 }
 
 /// What a block starts with.
-#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 pub(super) struct BlockHead {
     pub magic: [u8; 8],
@@ -73,7 +73,7 @@ pub(super) struct BlockHead {
     pub check: u64,
 }
 
-#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 struct PartHead {
     generation: u32,

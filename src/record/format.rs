@@ -13,7 +13,7 @@ use crate::encoding;
 use crate::scenario::{Scenario, scenario_hash};
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::{Xxh3, xxh3_64};
-use zerocopy::{FromBytes, Immutable, IntoBytes, KnownLayout};
+use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 /// First bytes of a recording.
 pub const FILE_MAGIC: [u8; 8] = *b"CZLOG\r\n\x1a";
@@ -34,7 +34,7 @@ pub(super) fn digest(pieces: &[&[u8]]) -> Digest {
 }
 
 /// What a file starts with.
-#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 pub(super) struct FileHead {
     pub magic: [u8; 8],
@@ -68,7 +68,7 @@ impl FileHead {
 }
 
 /// What follows every block.
-#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 pub(super) struct Seal {
     /// Of the block.
@@ -89,7 +89,7 @@ pub(super) fn next_link(link: &Digest, block: &Digest) -> Digest {
 }
 
 /// What the end section starts with.
-#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 pub(super) struct EndHead {
     pub magic: [u8; 8],
@@ -121,7 +121,7 @@ impl EndHead {
 }
 
 /// Where a step's block is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 pub(super) struct Entry {
     pub step: u64,
@@ -130,7 +130,7 @@ pub(super) struct Entry {
 }
 
 /// The last bytes of a file that was closed in order.
-#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable, KnownLayout)]
+#[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable)]
 #[repr(C)]
 pub(super) struct Tail {
     pub magic: [u8; 8],

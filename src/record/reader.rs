@@ -256,11 +256,12 @@ impl<S: Source> Reader<S> {
 
     /// The numbers of the steps that are there, ascending. Those of a file with an index have not been
     /// looked at yet.
-    pub fn step_numbers(&self) -> impl ExactSizeIterator<Item = u64> + '_ {
+    pub fn step_numbers(&self) -> impl DoubleEndedIterator<Item = u64> + ExactSizeIterator + '_ {
         self.steps.iter().map(|entry| entry.step)
     }
 
-    /// Ranges of steps, from 0 to the last that is there, that are not in the file: first and last.
+    /// Ranges of steps that are not in the file, first and last: between 0 and the last that is there, and
+    /// those after it of which the footer knows.
     pub fn gaps(&self) -> Vec<(u64, u64)> {
         let mut next = 0;
         let mut gaps = Vec::new();
@@ -270,6 +271,8 @@ impl<S: Source> Reader<S> {
             }
             next = step.saturating_add(1);
         }
+        let known = self.footer().map_or(&[][..], |footer| &footer.missing);
+        gaps.extend(known.iter().filter(|(first, last)| *first >= next && first <= last));
         gaps
     }
 

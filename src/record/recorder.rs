@@ -32,9 +32,9 @@ pub struct QueueLimits {
 }
 
 impl Default for QueueLimits {
-    /// 1024 steps, 256 MiB.
+    /// 8192 steps, 128 MiB.
     fn default() -> QueueLimits {
-        QueueLimits { steps: 1024, bytes: 256 << 20 }
+        QueueLimits { steps: 8192, bytes: 128 << 20 }
     }
 }
 
@@ -89,8 +89,14 @@ pub struct Recorded {
 impl Recorded {
     /// Number of steps that are not in the file.
     pub fn missing_steps(&self) -> u64 {
-        self.missing.iter().map(|(first, last)| last - first + 1).sum()
+        steps_in(&self.missing)
     }
+}
+
+/// Number of steps in ranges of first and last. Saturates: ranges may come from a file.
+pub fn steps_in(ranges: &[(u64, u64)]) -> u64 {
+    let length = |(first, last): &(u64, u64)| last.saturating_sub(*first).saturating_add(1);
+    ranges.iter().map(length).fold(0, u64::saturating_add)
 }
 
 enum Message {
@@ -131,7 +137,27 @@ impl Recorder {
         Recorder { queue, spares, spare: None, waiting_bytes, limits, thread, next: 0, missing: Vec::new() }
     }
 
-    /// Records a step; `false` when it could not be let in.
+    /// Records a step, and waits while the queue is full: for runs that keep no clock, which come out the same
+    /// however long a step takes. `false` when the recorder has failed.
+    pub fn push_or_wait(&mut self, frames: &StepFrames<'_>) -> bool {
+        let mut block = self.buffer();
+        frames.encode_onto(&mut block);
+        let length = block.len();
+        while !self.has_room(length) && !self.thread.is_finished() {
+            // Bytes are the tighter limit only for steps so large that writing one takes milliseconds.
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let step = frames.header.step;
+        self.advance(step);
+        self.waiting_bytes.fetch_add(length, Ordering::Relaxed);
+        let sent = self.queue.send(Message::Block(block)).is_ok();
+        if !sent {
+            self.miss(step, step);
+        }
+        sent
+    }
+
+    /// Records a step; `false` when it could not be let in. Never waits.
     pub fn push(&mut self, frames: &StepFrames<'_>) -> bool {
         let mut block = self.buffer();
         frames.encode_onto(&mut block);
@@ -164,14 +190,24 @@ impl Recorder {
         buffer
     }
 
-    fn enqueue(&mut self, step: u64, block: Vec<u8>) -> bool {
+    /// Whether so many bytes more may wait.
+    fn has_room(&self, length: usize) -> bool {
+        let waiting = self.waiting_bytes.load(Ordering::Relaxed);
+        waiting == 0 || waiting + length <= self.limits.bytes
+    }
+
+    /// Notes the steps that were left out before this one.
+    fn advance(&mut self, step: u64) {
         if step > self.next {
             self.miss(self.next, step - 1);
         }
         self.next = step.saturating_add(1);
+    }
+
+    fn enqueue(&mut self, step: u64, block: Vec<u8>) -> bool {
+        self.advance(step);
         let length = block.len();
-        let waiting = self.waiting_bytes.load(Ordering::Relaxed);
-        let refused = if waiting > 0 && waiting + length > self.limits.bytes {
+        let refused = if !self.has_room(length) {
             Some(block)
         } else {
             self.waiting_bytes.fetch_add(length, Ordering::Relaxed);

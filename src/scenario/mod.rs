@@ -18,7 +18,10 @@ pub use arrivals::ArrivalStream;
 pub use check::ScenarioFault;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use encode::{DecodeError, decode, encode, scenario_hash};
-pub use load::{DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file};
+pub use load::{
+    DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
+    text_of,
+};
 pub use network::{Approach, Exit, Network, Road, Source, Zone, ZoneId};
 pub use params::{
     Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,

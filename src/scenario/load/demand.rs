@@ -19,6 +19,8 @@ pub(super) enum TraceBase {
     Directory(PathBuf),
     /// Among the embedded ones; other paths are relative to the current directory.
     Embedded,
+    /// Among these, by path.
+    Given(Vec<(String, Vec<u8>)>),
 }
 
 /// Reads the demand of all roads; traces that several roads share are read once.
@@ -133,6 +135,12 @@ impl DemandReader<'_> {
                 Some(text) => return Ok((format!("<embedded>/{path}"), text.as_bytes().to_vec())),
                 None => PathBuf::from(path),
             },
+            TraceBase::Given(traces) => {
+                let given = traces.iter().find(|(name, _)| name == path);
+                let missing =
+                    || field.bad_because(Some("not given".into()), "an arrival trace that is given");
+                return given.map(|(name, bytes)| (name.clone(), bytes.clone())).ok_or_else(missing);
+            }
         };
         match std::fs::read(&file) {
             Ok(bytes) => Ok((file.display().to_string(), bytes)),
