@@ -8,6 +8,7 @@ pub mod coordination;
 pub mod encoding;
 pub mod lockstep;
 pub mod process;
+pub mod record;
 pub mod reproduce;
 pub mod scenario;
 pub mod shield;

@@ -24,7 +24,7 @@ pub use code::{Code, CodeValue};
 pub use command::*;
 pub use coordination::*;
 pub use header::*;
-pub use record::{Field, Layout, Record, Scalar, bytes_of};
+pub use record::{Field, Layout, Record, Scalar, bytes_of, records_from};
 pub use run_spec::*;
 pub use services::*;
 pub use state::*;

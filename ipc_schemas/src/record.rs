@@ -4,6 +4,8 @@
 //! the struct itself (`#[repr(C)]`), its [`Layout`] for the generators and the schema hash, and a
 //! compile-time proof that it has no padding.
 
+use zerocopy::IntoBytes;
+
 /// The scalar types a record field may have. All are little-endian on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scalar {
@@ -97,6 +99,9 @@ pub trait Record:
     + core::fmt::Debug
     + Send
     + iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend
+    + zerocopy::FromBytes
+    + IntoBytes
+    + zerocopy::Immutable
     + 'static
 {
     /// The record's layout.
@@ -121,6 +126,7 @@ macro_rules! record {
         #[derive(
             Clone, Copy, Debug, Default, PartialEq,
             iceoryx2_bb_derive_macros::ZeroCopySend,
+            zerocopy::FromBytes, zerocopy::IntoBytes, zerocopy::Immutable,
             serde::Serialize, serde::Deserialize,
         )]
         #[type_name($type_name)]
@@ -165,7 +171,34 @@ macro_rules! record {
 
 /// The memory of records as bytes, for hashing and storage.
 pub fn bytes_of<R: Record>(records: &[R]) -> &[u8] {
-    // SAFETY: `record!` proves at compile time that a record has no padding and consists of plain
-    // scalars, so every byte is initialised; u8 has no alignment; the length is that of the slice.
-    unsafe { core::slice::from_raw_parts(records.as_ptr().cast::<u8>(), size_of_val(records)) }
+    records.as_bytes()
+}
+
+/// The records of such bytes, which may lie anywhere in memory; `None` when their number is not that of
+/// whole records. Every bit pattern is a record, so nothing more is checked.
+pub fn records_from<R: Record>(bytes: &[u8]) -> Option<Vec<R>> {
+    if !bytes.len().is_multiple_of(size_of::<R>()) {
+        return None;
+    }
+    let mut records = vec![R::default(); bytes.len() / size_of::<R>()];
+    records.as_mut_bytes().copy_from_slice(bytes);
+    Some(records)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::VehicleState;
+
+    #[test]
+    fn records_survive_as_bytes_wherever_these_lie() {
+        let records = [VehicleState { x_m: 1.5, vehicle: 7, ..VehicleState::default() }; 3];
+        for shift in 0..8 {
+            let mut bytes = vec![0xaa; shift];
+            bytes.extend_from_slice(bytes_of(&records));
+            assert_eq!(records_from::<VehicleState>(&bytes[shift..]).as_deref(), Some(&records[..]));
+            assert_eq!(records_from::<VehicleState>(&bytes[shift..bytes.len() - 1]), None);
+        }
+        assert_eq!(records_from::<VehicleState>(&[]).as_deref(), Some(&[][..]));
+    }
 }

@@ -32,6 +32,12 @@ pub(super) enum Command {
     Ctrl(PartArgs),
     /// Compute one reference trajectory: duration, coefficients, cost.
     Plan(PlanArgs),
+    /// Show a recording: what it is of, one of its steps, or a vehicle's course.
+    Show(ShowArgs),
+    /// Compare two recordings: the first step, vehicle and field in which they differ.
+    Verify(VerifyArgs),
+    /// Run every role of a recording again from its recorded inputs and compare.
+    Replay(ReplayArgs),
     /// Regenerate the paper's tables and figures with intervals, verdicts and errata.
     Reproduce(ReproduceArgs),
     /// Measure latency, the solver, or scale on this machine.
@@ -279,6 +285,9 @@ pub(super) struct RunArgs {
     /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,
+    /// Record every frame of the run in this file (.czlog); an older recording is replaced.
+    #[arg(long, value_name = "FILE")]
+    pub record: Option<PathBuf>,
     /// Name of the run; runs of different names do not see each other [default: one of its own].
     #[arg(long, value_name = "NAME")]
     pub run: Option<RunName>,
@@ -355,6 +364,44 @@ pub(super) struct PlanArgs {
     /// Use the transversality condition as the paper prints it.
     #[arg(long)]
     pub as_printed: bool,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct ShowArgs {
+    /// The recording.
+    pub file: PathBuf,
+    /// Show one step: states, assignments and commands.
+    #[arg(long, value_name = "K", conflicts_with = "vehicle")]
+    pub step: Option<u64>,
+    /// Show the course of one vehicle.
+    #[arg(long, value_name = "ID")]
+    pub vehicle: Option<u32>,
+    /// Print the scenario's text and what was changed in it.
+    #[arg(long, conflicts_with_all = ["step", "vehicle", "json"])]
+    pub scenario: bool,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct VerifyArgs {
+    /// One recording.
+    pub first: PathBuf,
+    /// The other.
+    pub second: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct ReplayArgs {
+    /// The recording.
+    pub file: PathBuf,
     /// Print JSON.
     #[arg(long)]
     pub json: bool,

@@ -7,10 +7,15 @@ mod golden;
 mod parts;
 mod plan;
 mod plugin;
+mod record;
 mod report;
 mod run;
 mod sdk;
+mod show;
 mod supervise;
+
+#[cfg(fuzzing)]
+pub use show::everything as show_everything;
 
 use crate::process::ProcessError;
 use crate::reproduce::{self, ReproduceError};
@@ -80,6 +85,9 @@ pub fn cz() -> ExitCode {
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
             args::Command::Plan(args) => plan::plan(&args),
+            args::Command::Show(args) => show::show(&args),
+            args::Command::Verify(args) => record::verify(&args),
+            args::Command::Replay(args) => record::replay(&args),
             args::Command::Reproduce(args) => reproduce::cli::main(&args).map_err(AppError::from),
             args::Command::Bench(args) => bench::bench(&args),
             args::Command::Plugin { command } => plugin::plugin(&command),

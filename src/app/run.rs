@@ -1,10 +1,12 @@
 //! `cz run`: a whole run, in this process or in several.
 
 use super::args::RunArgs;
+use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
 use super::{AppError, controllers};
-use crate::process::{StopFlag, WaitMode, check_cores, run_in_process};
+use crate::lockstep::in_process::InProcess;
+use crate::process::{StopFlag, WaitMode, check_cores, run_in_process, run_in_process_observed};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::World;
@@ -24,13 +26,30 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         let problem = "--in-process: the scenario has controllers that are processes of their own";
         return Err(AppError::Usage(problem.to_owned()));
     }
+    if args.record.is_some() && !args.in_process {
+        let problem = "--record: runs of several processes cannot be recorded yet; add --in-process";
+        return Err(AppError::Usage(problem.to_owned()));
+    }
     let bar = Bar::new(&scenario);
+    let mut recorded = Ok(());
     let (transport, outcome) = if args.in_process {
         let stop = StopFlag::from_signals()?;
         let shares = args.share;
-        let outcome = run_in_process(&scenario, shares.coord_procs, shares.ctrl_procs, &stop, |world| {
-            bar.show(Position::of(world));
-        });
+        let (coordinators, controllers) = (shares.coord_procs, shares.ctrl_procs);
+        let progress = |world: &World| bar.show(Position::of(world));
+        let outcome = match &args.record {
+            None => run_in_process(&scenario, coordinators, controllers, &stop, progress),
+            Some(path) => {
+                let mut recording = Recording::start(path, &arguments, &scenario, shares, InProcess::RUN_ID)?;
+                let outcome =
+                    run_in_process_observed(&scenario, coordinators, controllers, &stop, progress, |f| {
+                        recording.push(f);
+                    });
+                bar.finish();
+                recorded = recording.finish(&outcome);
+                outcome
+            }
+        };
         (Transport::InProcess, outcome.map_err(AppError::from))
     } else {
         let processes = 1 + args.share.coord_procs + scenario.controllers(args.share.ctrl_procs);
@@ -47,7 +66,9 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
     };
     bar.finish();
-    Summary::new(&scenario, transport, outcome?).deliver(args.json.as_deref())
+    Summary::new(&scenario, transport, outcome?).deliver(args.json.as_deref())?;
+    // A recording that failed does not take the results with it.
+    recorded
 }
 
 /// A run name nobody else has.

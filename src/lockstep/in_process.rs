@@ -6,9 +6,11 @@ use super::{
 };
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
+use crate::record::{CommandPart, POLICY_NONE, StepFrames};
 use crate::scenario::Scenario;
 use crate::scenario::share::{neighbour_coordinators, zones_of};
-use crate::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
+use crate::transport::memory::{MemoryFrame, MemoryInbox, MemoryOutbox, MemoryService};
+use crate::transport::{Frame, Inbox};
 use crate::world::World;
 use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::sync::Arc;
@@ -34,15 +36,38 @@ pub struct InProcess {
     world: WorldSide,
     coordinators: Vec<CoordinatorSide>,
     controllers: Vec<ControllerSide>,
+    /// Present when somebody looks on.
+    observer: Option<Observer>,
+}
+
+/// Sees every frame of a run.
+#[derive(Debug)]
+struct Observer {
+    state: MemoryInbox<VehicleState>,
+    summaries: Vec<MemoryInbox<ZoneSummary>>,
+    coordination: MemoryInbox<Assignment>,
+    command: MemoryInbox<VehicleCommand>,
 }
 
 impl InProcess {
+    /// The run id of all frames.
+    pub const RUN_ID: u64 = 1;
+
     /// A run of the scenario with that many coordinator and controller roles. The built-in law stands in
     /// for every plug-in.
     pub fn new(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32) -> InProcess {
+        InProcess::build(scenario, coordinators, controllers, false)
+    }
+
+    /// The same, and [`frames`](Self::frames) must be asked for after each step.
+    pub fn observed(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32) -> InProcess {
+        InProcess::build(scenario, coordinators, controllers, true)
+    }
+
+    fn build(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32, observed: bool) -> InProcess {
         let scenario = &Arc::new(scenario.without_plugins());
         let zones = scenario.network.zones.len() as u32;
-        let run_id = 1;
+        let run_id = InProcess::RUN_ID;
         let mut state = MemoryService::new();
         let mut coordination = MemoryService::new();
         let mut command = MemoryService::new();
@@ -56,6 +81,12 @@ impl InProcess {
         let coordinator_inboxes: Vec<_> =
             coordinator_states.iter_mut().zip(&mut summaries).map(|(c, s)| (c.inbox(), s.inbox())).collect();
         let command_inbox = command.inbox();
+        let observer = observed.then(|| Observer {
+            state: state.tap(),
+            summaries: summaries.iter_mut().map(MemoryService::tap).collect(),
+            coordination: coordination.tap(),
+            command: command.tap(),
+        });
         let masks = neighbour_coordinators(&scenario.network, coordinators);
         let identity = |role, index| Identity { run_id, role, index: index as u16, generation: 0 };
         let coordinators_side = coordinator_inboxes
@@ -96,6 +127,7 @@ impl InProcess {
             world: WorldDriver::new(world, ports, run_id, controllers),
             coordinators: coordinators_side,
             controllers: controllers_side,
+            observer,
         }
     }
 
@@ -144,9 +176,51 @@ impl InProcess {
         }
     }
 
+    /// Shows the frames of the step that [`step`](Self::step) has just run, also of the last one, for which
+    /// it returned `false`. Does nothing unless the run is [`observed`](Self::observed).
+    pub fn frames(&mut self, show: impl FnOnce(&StepFrames<'_>)) -> Result<(), LockstepError> {
+        let Some(observer) = &mut self.observer else { return Ok(()) };
+        let Some(state) = observer.state.receive()? else { return Ok(()) };
+        let mut summaries = Vec::new();
+        for inbox in &mut observer.summaries {
+            take_all(inbox, &mut summaries)?;
+        }
+        let (mut coordination, mut commands) = (Vec::new(), Vec::new());
+        take_all(&mut observer.coordination, &mut coordination)?;
+        take_all(&mut observer.command, &mut commands)?;
+        // By sender, as whoever sends first is a matter of chance elsewhere.
+        coordination.sort_by_key(|frame| frame.header().sender_index);
+        commands.sort_by_key(|frame| frame.header().sender_index);
+        show(&StepFrames {
+            header: *state.header(),
+            state: state.records(),
+            summaries: &summaries.iter().map(Frame::records).collect::<Vec<_>>(),
+            coordination: &coordination.iter().map(Frame::records).collect::<Vec<_>>(),
+            commands: &commands
+                .iter()
+                .map(|frame| CommandPart { generation: frame.header().generation, records: frame.records() })
+                .collect::<Vec<_>>(),
+            misses: 0,
+            policy: POLICY_NONE,
+            state_hash: self.world.world().state_hash(),
+        });
+        Ok(())
+    }
+
     /// Runs to the end.
     pub fn run(&mut self) -> Result<(), LockstepError> {
         while self.step()? {}
         Ok(())
     }
+}
+
+/// Takes all frames that have come.
+fn take_all<R: ipc_schemas::Record>(
+    inbox: &mut MemoryInbox<R>,
+    frames: &mut Vec<MemoryFrame<R>>,
+) -> Result<(), LockstepError> {
+    while let Some(frame) = inbox.receive()? {
+        frames.push(frame);
+    }
+    Ok(())
 }

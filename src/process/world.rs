@@ -4,6 +4,7 @@ use super::attach::{Readiness, Reception};
 use super::{Patience, Peer, Peers, ProcessError, StopFlag, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Awaited, Progress, RefusedFrames, Seat, WorldDriver, WorldPorts};
+use crate::record::StepFrames;
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
 use crate::transport::{Inbox, Outbox};
@@ -382,11 +383,38 @@ pub fn run_in_process(
     coordinators: u32,
     controllers: u32,
     stop: &StopFlag,
-    mut progress: impl FnMut(&World),
+    progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
     let mut run = InProcess::new(scenario, coordinators, controllers);
+    drive(&mut run, stop, progress, |_| {})
+}
+
+/// The same, and shows the frames of every step.
+pub fn run_in_process_observed(
+    scenario: &Arc<Scenario>,
+    coordinators: u32,
+    controllers: u32,
+    stop: &StopFlag,
+    progress: impl FnMut(&World),
+    observe: impl FnMut(&StepFrames<'_>),
+) -> Result<Outcome, ProcessError> {
+    let mut run = InProcess::observed(scenario, coordinators, controllers);
+    drive(&mut run, stop, progress, observe)
+}
+
+fn drive(
+    run: &mut InProcess,
+    stop: &StopFlag,
+    mut progress: impl FnMut(&World),
+    mut observe: impl FnMut(&StepFrames<'_>),
+) -> Result<Outcome, ProcessError> {
     let mut meter = StepMeter::start();
-    while run.step()? {
+    loop {
+        let goes_on = run.step()?;
+        run.frames(&mut observe)?;
+        if !goes_on {
+            break;
+        }
         meter.step_done(run.was_event());
         let step = run.world().step();
         if step.is_multiple_of(STEPS_PER_LOOK) {

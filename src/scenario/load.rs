@@ -17,11 +17,13 @@ pub use error::{Place, ScenarioError};
 pub use overrides::Override;
 
 use super::{Network, Road, Scenario, ShieldMode, embedded};
-use demand::{DemandReader, MAX_TIME_S, TraceBase};
+use demand::{DemandReader, TraceBase};
+pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
 use std::collections::BTreeMap;
 use std::path::Path;
 use table::Table;
+pub(super) use topology::MAX_COUNT;
 
 /// The scenario that runs when none is named.
 pub const DEFAULT_SCENARIO: &str = "two-merges";
@@ -44,20 +46,43 @@ pub fn load(
     overrides: &[Override],
     seed: Option<u64>,
 ) -> Result<Scenario, ScenarioError> {
-    let name = argument.unwrap_or(DEFAULT_SCENARIO);
-    let path = Path::new(name);
-    // The default must not depend on what the current directory happens to hold.
-    if argument.is_some() && (name.contains('/') || name.ends_with(".toml") || path.is_file()) {
-        load_file(path, overrides, seed)
-    } else {
-        load_embedded(name, overrides, seed)
+    match file_of(argument) {
+        Some(path) => load_file(path, overrides, seed),
+        None => load_embedded(argument.unwrap_or(DEFAULT_SCENARIO), overrides, seed),
     }
+}
+
+/// The text of the scenario a command line names, as it is before anything is changed in it.
+pub fn text_of(argument: Option<&str>) -> Result<String, ScenarioError> {
+    match file_of(argument) {
+        Some(path) => read_text(path),
+        None => Ok(text_of_embedded(argument.unwrap_or(DEFAULT_SCENARIO))?.to_owned()),
+    }
+}
+
+/// The file an argument names, if it names one.
+fn file_of(argument: Option<&str>) -> Option<&Path> {
+    // The default must not depend on what the current directory happens to hold.
+    let name = argument?;
+    let path = Path::new(name);
+    (name.contains('/') || name.ends_with(".toml") || path.is_file()).then_some(path)
+}
+
+fn read_text(path: &Path) -> Result<String, ScenarioError> {
+    std::fs::read_to_string(path).map_err(|source| ScenarioError::Read { path: path.to_owned(), source })
+}
+
+fn text_of_embedded(name: &str) -> Result<&'static str, ScenarioError> {
+    embedded_text(name).ok_or_else(|| ScenarioError::UnknownScenario {
+        name: name.to_owned(),
+        known: embedded_names().collect::<Vec<_>>().join(", "),
+        suggestion: error::nearest(name, embedded_names()),
+    })
 }
 
 /// Loads a scenario file. Traces are relative to its directory. `seed` goes before the file's.
 pub fn load_file(path: &Path, overrides: &[Override], seed: Option<u64>) -> Result<Scenario, ScenarioError> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|source| ScenarioError::Read { path: path.to_owned(), source })?;
+    let text = read_text(path)?;
     let base = TraceBase::Directory(path.parent().unwrap_or(Path::new("")).to_owned());
     load_text(&path.display().to_string(), &text, base, overrides, seed)
 }
@@ -68,14 +93,19 @@ pub fn load_embedded(
     overrides: &[Override],
     seed: Option<u64>,
 ) -> Result<Scenario, ScenarioError> {
-    let Some(text) = embedded_text(name) else {
-        return Err(ScenarioError::UnknownScenario {
-            name: name.to_owned(),
-            known: embedded_names().collect::<Vec<_>>().join(", "),
-            suggestion: error::nearest(name, embedded_names()),
-        });
-    };
+    let text = text_of_embedded(name)?;
     load_text(&format!("<embedded>/{name}.toml"), text, TraceBase::Embedded, overrides, seed)
+}
+
+/// Loads the text of a scenario and the traces it names, all given: path as the text has it, and contents.
+/// Nothing is read from anywhere else.
+pub fn load_given(
+    text: &str,
+    traces: Vec<(String, Vec<u8>)>,
+    overrides: &[Override],
+    seed: Option<u64>,
+) -> Result<Scenario, ScenarioError> {
+    load_text("<given>", text, TraceBase::Given(traces), overrides, seed)
 }
 
 fn load_text(

@@ -4,6 +4,7 @@
 //! points at something, and the network is acyclic. Nothing downstream checks these again.
 
 pub mod arrivals;
+mod check;
 pub mod demand;
 mod embedded;
 pub mod encode;
@@ -14,9 +15,13 @@ pub mod plugins;
 pub mod share;
 
 pub use arrivals::ArrivalStream;
+pub use check::ScenarioFault;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use encode::{DecodeError, decode, encode, scenario_hash};
-pub use load::{DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file};
+pub use load::{
+    DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
+    text_of,
+};
 pub use network::{Approach, Exit, Network, Road, Source, Zone, ZoneId};
 pub use params::{
     Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,

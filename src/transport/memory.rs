@@ -28,13 +28,15 @@ struct Sent<R> {
 #[derive(Debug, Default)]
 pub struct MemoryService<R> {
     queues: Vec<Queue<R>>,
+    /// Those who only look on.
+    taps: Vec<Queue<R>>,
     senders: Cell<usize>,
 }
 
 impl<R: Record> MemoryService<R> {
     /// A service without receivers.
     pub fn new() -> MemoryService<R> {
-        MemoryService { queues: Vec::new(), senders: Cell::new(0) }
+        MemoryService { queues: Vec::new(), taps: Vec::new(), senders: Cell::new(0) }
     }
 
     /// A new receiver.
@@ -44,10 +46,19 @@ impl<R: Record> MemoryService<R> {
         MemoryInbox { queue }
     }
 
+    /// A receiver that only looks on: it is not counted among those a frame reaches, and may leave as many
+    /// frames untaken as it likes.
+    pub fn tap(&mut self) -> MemoryInbox<R> {
+        let queue = Queue::default();
+        self.taps.push(queue.clone());
+        MemoryInbox { queue }
+    }
+
     /// A sender to all present receivers.
     pub fn outbox(&self) -> MemoryOutbox<R> {
         let sender = self.senders.replace(self.senders.get() + 1);
-        MemoryOutbox { sender, queues: self.queues.clone(), buffers: Vec::new() }
+        let (queues, taps) = (self.queues.clone(), self.taps.clone());
+        MemoryOutbox { sender, queues, taps, buffers: Vec::new() }
     }
 }
 
@@ -57,6 +68,7 @@ pub struct MemoryOutbox<R> {
     /// Number among the outboxes of the service.
     sender: usize,
     queues: Vec<Queue<R>>,
+    taps: Vec<Queue<R>>,
     /// Buffers sent before; those nobody reads any more are used again.
     buffers: Vec<Rc<Buffer<R>>>,
 }
@@ -103,6 +115,9 @@ impl<R: Record> Loan<R> for MemoryLoan<'_, R> {
                 queue.push_back(Sent { sender, buffer: self.buffer.clone() });
                 reached += 1;
             }
+        }
+        for tap in &self.outbox.taps {
+            tap.borrow_mut().push_back(Sent { sender, buffer: self.buffer.clone() });
         }
         self.outbox.buffers.push(self.buffer);
         Ok(reached)

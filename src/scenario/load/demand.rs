@@ -8,9 +8,9 @@ use std::path::PathBuf;
 use std::rc::Rc;
 
 /// Instants above this are refused: step numbers times nanoseconds stay far within 64 bits.
-pub(super) const MAX_TIME_S: f64 = 1e9;
+pub(in crate::scenario) const MAX_TIME_S: f64 = 1e9;
 /// 10 vehicles per second: no lane carries it, and it bounds the work per simulated second.
-const MAX_RATE_PER_HOUR: f64 = 36_000.0;
+pub(in crate::scenario) const MAX_RATE_PER_HOUR: f64 = 36_000.0;
 const HEADER: &str = "time_s,road,speed_mps";
 
 /// Where the traces a scenario names are found.
@@ -19,6 +19,8 @@ pub(super) enum TraceBase {
     Directory(PathBuf),
     /// Among the embedded ones; other paths are relative to the current directory.
     Embedded,
+    /// Among these, by path.
+    Given(Vec<(String, Vec<u8>)>),
 }
 
 /// Reads the demand of all roads; traces that several roads share are read once.
@@ -133,6 +135,12 @@ impl DemandReader<'_> {
                 Some(text) => return Ok((format!("<embedded>/{path}"), text.as_bytes().to_vec())),
                 None => PathBuf::from(path),
             },
+            TraceBase::Given(traces) => {
+                let given = traces.iter().find(|(name, _)| name == path);
+                let missing =
+                    || field.bad_because(Some("not given".into()), "an arrival trace that is given");
+                return given.map(|(name, bytes)| (name.clone(), bytes.clone())).ok_or_else(missing);
+            }
         };
         match std::fs::read(&file) {
             Ok(bytes) => Ok((file.display().to_string(), bytes)),

@@ -5,7 +5,7 @@ use super::table::{Field, Table};
 use crate::scenario::{Approach, Exit, FlowPolicy, Source, Zone};
 
 /// No more zones, roads, or approaches of a zone than this: frames carry their indices in 16 bits.
-pub(super) const MAX_COUNT: usize = 65_535;
+pub(in crate::scenario) const MAX_COUNT: usize = 65_535;
 
 /// The network's shape; flow policies are still [`FlowPolicy::None`].
 pub(super) struct Topology {

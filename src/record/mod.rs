@@ -1,0 +1,20 @@
+//! Recordings of runs: every frame of every step in one file, and what can be done with it.
+//!
+//! The writing side takes [`StepFrames`] from whoever has seen a step, as one block of bytes that can be made
+//! in one process and written by another. The reading side trusts nothing: see [`Reader`].
+
+mod block;
+mod compare;
+mod format;
+mod reader;
+mod recorder;
+mod replay;
+mod writer;
+
+pub use block::{BlockFault, CommandPart, Commands, POLICY_NONE, Step, StepFrames};
+pub use compare::{Comparison, Difference, Section, compare};
+pub use format::{Build, Footer, Metadata, Processes, RunEnd, ScenarioSource};
+pub use reader::{Damage, FileSource, Flaw, OpenError, Reader, Source, Steps};
+pub use recorder::{Output, QueueLimits, RecordError, Recorded, Recorder, steps_in};
+pub use replay::{Replay, ReplayError, RoleReport, Stop, replay, replay_world};
+pub use writer::{WriteError, Writer};

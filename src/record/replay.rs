@@ -1,0 +1,377 @@
+//! Runs the roles again from what they were given, and compares what they do with what was recorded.
+//!
+//! Each role gets its recorded inputs, not what another role has just computed: so it is the role that differs
+//! that is found, and not all that depend on it.
+
+use super::block::Step;
+use super::compare::{Difference, Rules, first_difference};
+use super::reader::{Damage, Reader, Source};
+use crate::control::ControllerPool;
+use crate::coordination::Coordinator;
+use crate::scenario::share::zones_of;
+use crate::scenario::{Drivers, Scenario};
+use crate::world::World;
+use ipc_schemas::{
+    Assignment, FLAG_END_OF_RUN, NO_ZONE, STATE_LEFT, VehicleCommand, VehicleState, ZoneSummary,
+};
+use std::ops::Range;
+
+/// Why a world cannot be brought to a step.
+#[derive(Debug, thiserror::Error)]
+pub enum ReplayError {
+    /// The file is damaged before that step.
+    #[error("the recording is damaged at {0}")]
+    Damaged(#[from] Damage),
+    /// A step before it is not in the file.
+    #[error("step {0} is not in the recording")]
+    Missing(u64),
+    /// The run did not get that far.
+    #[error("the recording ends at step {last}, before step {step}")]
+    TooFar {
+        /// Step asked for.
+        step: u64,
+        /// Last step there is.
+        last: u64,
+    },
+    /// The world came out elsewhere.
+    #[error("the replayed world differs from the recorded one: {0}")]
+    Differs(Box<Difference>),
+    /// The world does not take the recorded commands.
+    #[error("step {step}: the world does not take the recorded commands: {reason}")]
+    Commands {
+        /// Step.
+        step: u64,
+        /// What it said.
+        reason: String,
+    },
+}
+
+/// The world as it was before it published step `until`, brought there by the recorded commands. Every state
+/// on the way has been compared with the recorded one.
+pub fn replay_world<S: Source>(reader: &Reader<S>, until: u64) -> Result<World, ReplayError> {
+    let mut role = WorldReplay::new(reader);
+    for step in reader.steps() {
+        if role.world.step() == until {
+            return Ok(role.world);
+        }
+        let step = step?;
+        if step.header.step != role.world.step() {
+            return Err(ReplayError::Missing(role.world.step()));
+        }
+        role.take(&step)?;
+        if role.finished {
+            break;
+        }
+    }
+    let last = role.world.step();
+    if last == until && !role.finished {
+        Ok(role.world)
+    } else {
+        Err(ReplayError::TooFar {
+            step: until,
+            last: if role.finished { last } else { last.saturating_sub(1) },
+        })
+    }
+}
+
+/// What came of one role.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct RoleReport {
+    /// Role and index.
+    pub role: String,
+    /// Steps in which what it did was compared.
+    pub steps: u64,
+    /// Steps in which it was given its inputs and not compared, and why.
+    pub inputs_only: Option<(u64, &'static str)>,
+    /// The first step in which it did something else than was recorded, in words.
+    pub difference: Option<String>,
+}
+
+/// What came of a replay.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Replay {
+    /// World, coordinators, controllers.
+    pub roles: Vec<RoleReport>,
+    /// Steps read.
+    pub steps: u64,
+    /// The world's state hash after the last step it got right.
+    pub state_hash: u64,
+    /// Why the replay ended before the end of the recording, if it did.
+    pub stopped: Option<Stop>,
+}
+
+impl Replay {
+    /// Whether no role differed.
+    pub fn same(&self) -> bool {
+        self.roles.iter().all(|role| role.difference.is_none())
+    }
+}
+
+/// Why a replay ended early.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Stop {
+    /// Steps are missing: the first of them. Roles remember, so none can go on behind a gap.
+    Gap(u64),
+    /// The file is damaged.
+    Damage(Damage),
+}
+
+/// Replays every role from its recorded inputs.
+pub fn replay<S: Source>(reader: &Reader<S>, mut progress: impl FnMut(u64)) -> Replay {
+    let mut world = WorldReplay::new(reader);
+    let mut world_report = Tally::new("world".to_owned());
+    let mut coordinators = coordinators(reader);
+    let mut controllers = controllers(reader);
+    let mut before: Vec<ZoneSummary> = Vec::new();
+    let (mut steps, mut stopped) = (0, None);
+    for step in reader.steps() {
+        let step = match step {
+            Ok(step) if step.header.step == steps => step,
+            Ok(_) => {
+                stopped = Some(Stop::Gap(steps));
+                break;
+            }
+            Err(damage) => {
+                stopped = Some(Stop::Damage(damage));
+                break;
+            }
+        };
+        if world_report.difference.is_none() {
+            match world.take(&step) {
+                Ok(()) => world_report.steps += 1,
+                Err(error) => world_report.difference = Some(error.to_string()),
+            }
+        }
+        // The others index by what a state frame says; one that no world sends ends them as well.
+        let sound = sound_states(reader.scenario(), &step.state);
+        let is_last = step.header.flags & FLAG_END_OF_RUN != 0;
+        for (role, tally) in &mut coordinators {
+            tally.step(sound, |_| if is_last { Ok(false) } else { role.take(&step, &before) });
+        }
+        for (role, tally) in &mut controllers {
+            tally.step(sound, |skipped| if is_last { Ok(false) } else { role.take(&step, skipped) });
+        }
+        before = step.summaries;
+        steps += 1;
+        progress(steps);
+    }
+    // The last steps of the run may be missing as well.
+    if stopped.is_none() {
+        stopped = reader.gaps().first().map(|(first, _)| Stop::Gap(*first));
+    }
+    let tallies = coordinators.into_iter().map(|(_, t)| t).chain(controllers.into_iter().map(|(_, t)| t));
+    Replay {
+        roles: std::iter::once(world_report).chain(tallies).map(Tally::report).collect(),
+        steps,
+        state_hash: world.state_hash,
+        stopped,
+    }
+}
+
+struct Tally {
+    role: String,
+    steps: u64,
+    skipped: u64,
+    why: &'static str,
+    difference: Option<String>,
+}
+
+impl Tally {
+    fn new(role: String) -> Tally {
+        Tally { role, steps: 0, skipped: 0, why: "", difference: None }
+    }
+
+    /// Lets a role take a step unless it has gone astray; `Ok(true)` from it counts as compared.
+    fn step(&mut self, sound: Result<(), u32>, take: impl FnOnce(&mut u64) -> Result<bool, String>) {
+        if self.difference.is_some() {
+            return;
+        }
+        let taken = match sound {
+            Ok(()) => take(&mut self.skipped),
+            Err(vehicle) => Err(format!("the recorded state of vehicle {vehicle} is none a world sends")),
+        };
+        match taken {
+            Ok(compared) => self.steps += u64::from(compared),
+            Err(difference) => self.difference = Some(difference),
+        }
+    }
+
+    fn report(self) -> RoleReport {
+        let inputs_only = (self.skipped > 0).then_some((self.skipped, self.why));
+        RoleReport { role: self.role, steps: self.steps, inputs_only, difference: self.difference }
+    }
+}
+
+struct WorldReplay {
+    world: World,
+    /// With all frames that came out right in it.
+    state_hash: u64,
+    finished: bool,
+}
+
+impl WorldReplay {
+    fn new<S: Source>(reader: &Reader<S>) -> WorldReplay {
+        let metadata = reader.metadata();
+        let mut world = World::new(reader.scenario().clone(), metadata.coordinators);
+        world.share_out(metadata.controllers);
+        WorldReplay { world, state_hash: 0, finished: false }
+    }
+
+    /// Compares the world with the recorded state, then gives it the recorded commands.
+    fn take(&mut self, step: &Step) -> Result<(), ReplayError> {
+        let world = &mut self.world;
+        let masks = world.coordinator_masks();
+        let finished = world.is_finished();
+        let mut own = Step { state: world.records().collect(), ..step.clone() };
+        own.header.step = world.step();
+        own.header.time_ns = world.time_ns();
+        own.header.coordinators_acting = masks.acting;
+        own.header.coordinators_summarised = masks.summarised;
+        own.header.flags = if finished { FLAG_END_OF_RUN } else { 0 };
+        world.seal(&own.state);
+        own.state_hash = world.state_hash();
+        if let Some(difference) = first_difference(&own, step, Rules { same_processes: true }) {
+            return Err(ReplayError::Differs(Box::new(difference)));
+        }
+        self.state_hash = own.state_hash;
+        self.finished = finished;
+        if finished {
+            return Ok(());
+        }
+        let refused = |reason: String| ReplayError::Commands { step: step.header.step, reason };
+        let senders = world.drivers().count() as usize;
+        if step.commands.len() != senders {
+            return Err(refused(format!("they are of {} controllers, not {senders}", step.commands.len())));
+        }
+        for (index, part) in (0..).zip(&step.commands) {
+            world
+                .command(index, &part.records)
+                .map_err(|fault| refused(format!("controller {index}: {fault}")))?;
+        }
+        world.advance().map_err(|count| refused(format!("{count} vehicles are commanded by nobody")))
+    }
+}
+
+struct CoordinatorReplay {
+    role: Coordinator,
+    index: u32,
+    zones: Range<u32>,
+    all_zones: u32,
+}
+
+fn coordinators<S: Source>(reader: &Reader<S>) -> Vec<(CoordinatorReplay, Tally)> {
+    let all_zones = reader.scenario().network.zones.len() as u32;
+    let count = reader.metadata().coordinators;
+    let role = |index| {
+        let zones = zones_of(all_zones, index, count);
+        let role = Coordinator::new(reader.scenario().clone(), zones.clone());
+        let role = CoordinatorReplay { role, index, zones, all_zones };
+        (role, Tally::new(format!("coordinator {index}")))
+    };
+    (0..count).map(role).collect()
+}
+
+impl CoordinatorReplay {
+    /// Whether there was something to compare, or what differs.
+    fn take(&mut self, step: &Step, before: &[ZoneSummary]) -> Result<bool, String> {
+        let zones = self.zones.clone();
+        let assigned: Vec<Assignment> =
+            step.coordination.iter().filter(|a| zones.contains(&a.zone)).copied().collect();
+        let said: Vec<ZoneSummary> =
+            step.summaries.iter().filter(|s| zones.contains(&s.from_zone)).copied().collect();
+        let acts = step.header.coordinators_acting >> self.index & 1 == 1;
+        let (mut own_assigned, mut own_said) = (Vec::new(), Vec::new());
+        if acts {
+            // Those between zones of one process never leave it and are not recorded.
+            self.role.receive(before);
+            self.role.act(step.header.step, &step.state);
+            own_assigned.extend_from_slice(self.role.assignments());
+            own_said.extend(self.role.summaries(0..self.all_zones));
+        }
+        let recorded = Step { coordination: assigned, summaries: said, ..step.clone() };
+        let own = Step { coordination: own_assigned, summaries: own_said, ..step.clone() };
+        difference(&own, &recorded).map_or(Ok(acts), Err)
+    }
+}
+
+struct ControllerReplay {
+    role: ControllerPool,
+    index: usize,
+}
+
+fn controllers<S: Source>(reader: &Reader<S>) -> Vec<(ControllerReplay, Tally)> {
+    let scenario = reader.scenario();
+    let all_zones = scenario.network.zones.len() as u32;
+    let pool = Drivers::new(scenario, reader.metadata().controllers).pool();
+    let role = |index| {
+        let role = ControllerPool::new(scenario.clone(), zones_of(all_zones, index, pool));
+        let mut tally = Tally::new(format!("controller {index}"));
+        tally.why = "it did not answer in time";
+        (ControllerReplay { role, index: index as usize }, tally)
+    };
+    (0..pool).map(role).collect()
+}
+
+impl ControllerReplay {
+    fn take(&mut self, step: &Step, skipped: &mut u64) -> Result<bool, String> {
+        let number = step.header.step;
+        self.role
+            .coordinate(&step.state, &step.coordination)
+            .map_err(|fault| format!("step {number}: {fault}"))?;
+        let mut own: Vec<VehicleCommand> = Vec::new();
+        self.role
+            .command(step.header.time_ns as f64 * 1e-9, &step.state, |command| own.push(command))
+            .map_err(|fault| format!("step {number}: {fault}"))?;
+        if step.missed(self.index) {
+            *skipped += 1;
+            return Ok(false);
+        }
+        let mut recorded = step.clone();
+        for (index, part) in recorded.commands.iter_mut().enumerate() {
+            if index != self.index {
+                part.records.clear();
+            }
+        }
+        let mut replayed = recorded.clone();
+        match replayed.commands.get_mut(self.index) {
+            Some(part) => part.records = own,
+            None => return Err(format!("step {number}: the recording has no commands of it")),
+        }
+        difference(&replayed, &recorded).map_or(Ok(true), Err)
+    }
+}
+
+/// What a role did differently, in words.
+fn difference(own: &Step, recorded: &Step) -> Option<String> {
+    let difference = first_difference(own, recorded, Rules { same_processes: true })?;
+    Some(format!("{difference} (replayed / recorded)"))
+}
+
+/// Whether a recorded state frame is one that roles can be given: zones in order, paths that exist, numbers
+/// that are numbers; else the first vehicle of which it is not so.
+fn sound_states(scenario: &Scenario, states: &[VehicleState]) -> Result<(), u32> {
+    let mut last = 0;
+    for (i, state) in states.iter().enumerate() {
+        let is_first = i == 0 || states[i - 1].zone != state.zone;
+        let numbers = [
+            state.x_m,
+            state.v_mps,
+            state.u_mps2,
+            state.entry_time_s,
+            state.entry_speed_mps,
+            state.planned_exit_time_s,
+            state.planned_exit_speed_mps,
+        ];
+        let place = scenario.network.zones.get(state.zone as usize);
+        let on_path = place.is_some_and(|zone| (state.path as usize) < zone.approaches.len());
+        let sound = state.zone >= last
+            && (on_path || state.zone == NO_ZONE)
+            && (is_first || state.flags & STATE_LEFT == 0)
+            && numbers.iter().all(|n| n.is_finite());
+        if !sound {
+            return Err(state.vehicle);
+        }
+        last = state.zone;
+    }
+    Ok(())
+}

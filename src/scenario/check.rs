@@ -1,0 +1,271 @@
+//! Is this scenario one that the loader would have made? For scenarios that come as bytes from elsewhere.
+//!
+//! The loader refuses with places and keys; here there are none, and whoever meets a fault holds a file that
+//! no version of this program wrote.
+
+use super::{
+    Baseline, Demand, Exit, FlowPolicy, Network, Poisson, Scenario, Segment, Source, VehicleParams, Zone,
+};
+use crate::scenario::load::{MAX_COUNT, MAX_RATE_PER_HOUR, MAX_TIME_S};
+
+/// The first thing in a scenario that is not as the loader leaves it.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0}")]
+pub struct ScenarioFault(String);
+
+type Check = Result<(), ScenarioFault>;
+
+fn require(holds: bool, what: impl FnOnce() -> String) -> Check {
+    if holds { Ok(()) } else { Err(ScenarioFault(what())) }
+}
+
+/// Whether a number is finite and within a range; NaN is in none.
+fn number(what: &str, value: f64, within: impl FnOnce(f64) -> bool) -> Check {
+    require(value.is_finite() && within(value), || format!("{what} = {value}"))
+}
+
+impl Scenario {
+    /// Checks every value and index as the loader does.
+    pub fn check(&self) -> Result<(), ScenarioFault> {
+        require(self.dt_ns > 0 && self.dt_s() <= MAX_TIME_S, || format!("dt_ns = {}", self.dt_ns))?;
+        let dt_s = self.dt_s();
+        number("max_time_s", self.max_time_s, |t| t >= dt_s && t <= MAX_TIME_S)?;
+        require(self.max_vehicles != Some(0), || "max_vehicles = 0".to_owned())?;
+        number("beta", self.beta, |beta| beta > 0.0)?;
+        vehicle(&self.vehicle)?;
+        let control = &self.control;
+        for (what, gain) in [
+            ("k_rear_end_per_s", control.k_rear_end_per_s),
+            ("k_merge_per_s", control.k_merge_per_s),
+            ("k_speed_per_s", control.k_speed_per_s),
+            ("clf_rate_per_s", control.clf_rate_per_s),
+        ] {
+            number(what, gain, |k| k > 0.0)?;
+        }
+        number("slack_weight", control.slack_weight, |w| w >= 0.0)?;
+        number("fe_fraction", control.fe_fraction, |f| f > 0.0 && f <= 1.0)?;
+        network(&self.network, self.vehicle.v_max_mps * dt_s)?;
+        for zone in &self.network.zones {
+            flow(zone, &self.network, self.vehicle.v_max_mps)?;
+        }
+        for road in &self.network.roads {
+            demand(&road.demand, &self.vehicle)
+                .map_err(|fault| ScenarioFault(format!("road {}: {fault}", road.name)))?;
+        }
+        self.check_plugins()
+    }
+
+    fn check_plugins(&self) -> Check {
+        let mut names = std::collections::BTreeSet::new();
+        let mut driven = std::collections::BTreeSet::new();
+        for plugin in &self.plugins {
+            let bad = || format!("controller {}", plugin.name);
+            require(names.insert(&plugin.name) && !plugin.approaches.is_empty(), bad)?;
+            require(plugin.approaches.is_sorted(), bad)?;
+            for &(zone, path) in &plugin.approaches {
+                let there = self.network.zones.get(zone as usize);
+                let there = there.is_some_and(|z| (path as usize) < z.approaches.len());
+                require(there && driven.insert((zone, path)), bad)?;
+            }
+        }
+        Ok(())
+    }
+}
+
+fn vehicle(v: &VehicleParams) -> Check {
+    number("u_min_mps2", v.u_min_mps2, |u| u < 0.0)?;
+    number("u_max_mps2", v.u_max_mps2, |u| u > 0.0)?;
+    number("v_min_mps", v.v_min_mps, |s| s >= 0.0)?;
+    number("v_max_mps", v.v_max_mps, |s| s > v.v_min_mps)?;
+    number("length_m", v.length_m, |l| l > 0.0)?;
+    number("reaction_time_s", v.reaction_time_s, |t| t > 0.0)?;
+    number("standstill_gap_m", v.standstill_gap_m, |g| g >= 0.0)
+}
+
+/// Indices point at something, both ends of a connection know of each other, and zones come upstream first.
+fn network(network: &Network, step_m: f64) -> Check {
+    let (zones, roads) = (&network.zones, &network.roads);
+    require(!zones.is_empty() && zones.len() <= MAX_COUNT, || format!("{} zones", zones.len()))?;
+    require(!roads.is_empty() && roads.len() <= MAX_COUNT, || format!("{} roads", roads.len()))?;
+    let mut roads_used = 0;
+    for (index, zone) in (0..).zip(zones) {
+        let bad = || format!("zone {}: the network does not hang together", zone.name);
+        require(!zone.approaches.is_empty() && zone.approaches.len() <= MAX_COUNT, bad)?;
+        for (path, approach) in (0..).zip(&zone.approaches) {
+            number("length_m", approach.length_m, |l| l > 0.0 && l >= step_m)?;
+            match approach.source {
+                Source::Road(road) => {
+                    let road = roads.get(road as usize);
+                    require(road.is_some_and(|r| (r.zone, r.path) == (index, path)), bad)?;
+                    roads_used += 1;
+                }
+                Source::Zone(up) => {
+                    let exit = zones.get(up as usize).map(|z| z.exit);
+                    let here =
+                        |exit| matches!(exit, Exit::Zone { zone, path: p, .. } if (zone, p) == (index, path));
+                    require(up < index && exit.is_some_and(here), bad)?;
+                }
+            }
+        }
+        if let Exit::Zone { zone: down, path, link_m } = zone.exit {
+            let source = zones.get(down as usize).and_then(|z| z.approaches.get(path as usize));
+            require(source.is_some_and(|a| a.source == Source::Zone(index)), bad)?;
+            number("link_m", link_m, |l| l == 0.0 || (l > 0.0 && l >= step_m))?;
+        }
+    }
+    require(roads_used == roads.len(), || "a road that leads nowhere".to_owned())
+}
+
+fn flow(zone: &Zone, network: &Network, v_max_mps: f64) -> Check {
+    let speed = |what, value| number(what, value, |v| v > 0.0 && v <= v_max_mps);
+    let downstream = match zone.exit {
+        Exit::Out => None,
+        Exit::Zone { zone, .. } => Some(&network.zones[zone as usize]),
+    };
+    let longest_m = |zone: &Zone| zone.approaches.iter().map(|a| a.length_m).fold(0.0, f64::max);
+    let observes = |l: f64| {
+        let longest_m = downstream.map_or(0.0, longest_m);
+        number("segment_m", l, |l| l > 0.0 && l <= longest_m)
+    };
+    let has_downstream =
+        || require(downstream.is_some(), || format!("zone {}: nothing to observe", zone.name));
+    match &zone.flow {
+        FlowPolicy::None => Ok(()),
+        FlowPolicy::Fixed { terminal_mps } => speed("terminal_mps", *terminal_mps),
+        FlowPolicy::Feedback { baseline, gain_mps, segment, min_mps } => {
+            has_downstream()?;
+            match baseline {
+                Baseline::Given(baseline) => speed("baseline_mps", *baseline)?,
+                Baseline::Optimal(speeds) => {
+                    require(!speeds.is_empty(), || "no baseline_entry_speeds_mps".to_owned())?;
+                    speeds.iter().try_for_each(|v| speed("baseline_entry_speeds_mps", *v))?;
+                }
+            }
+            number("gain_mps", *gain_mps, |k| k >= 0.0)?;
+            speed("min_mps", *min_mps)?;
+            match segment {
+                Segment::Whole => Ok(()),
+                Segment::First(l) => observes(*l),
+            }
+        }
+        FlowPolicy::MeanSpeed { offset_mps, gain_mps, segment_m, min_mps } => {
+            has_downstream()?;
+            number("offset_mps", *offset_mps, |_| true)?;
+            number("gain_mps", *gain_mps, |k| k >= 0.0)?;
+            speed("min_mps", *min_mps)?;
+            observes(*segment_m)
+        }
+    }
+}
+
+fn demand(demand: &Demand, vehicle: &VehicleParams) -> Check {
+    let VehicleParams { v_min_mps, v_max_mps, .. } = *vehicle;
+    let Poisson { rates, min_headway_s, speed } = match demand {
+        Demand::Poisson(process) => process,
+        Demand::Trace(arrivals) => {
+            let mut last_s = 0.0;
+            for arrival in arrivals {
+                number("time_s", arrival.time_s, |t| t >= last_s && t <= MAX_TIME_S)?;
+                number("speed_mps", arrival.speed_mps, |v| v >= v_min_mps && v <= v_max_mps)?;
+                last_s = arrival.time_s;
+            }
+            return Ok(());
+        }
+    };
+    number("min_headway_s", *min_headway_s, |h| h >= 0.0)?;
+    let mut last_s = 0.0;
+    for period in rates {
+        number("until_s", period.until_s, |t| t > last_s && t <= MAX_TIME_S)?;
+        let rate = period.vehicles_per_hour;
+        number("vehicles_per_hour", rate, |r| (0.0..=MAX_RATE_PER_HOUR).contains(&r))?;
+        number("min_headway_s", *min_headway_s, |h| rate * h < 3600.0)?;
+        last_s = period.until_s;
+    }
+    number("speed_min_mps", speed.min_mps, |v| v >= v_min_mps && v <= v_max_mps)?;
+    number("speed_max_mps", speed.max_mps, |v| v >= speed.min_mps && v <= v_max_mps)?;
+    number("speed_mean_mps", speed.mean_mps, |v| v >= speed.min_mps && v <= speed.max_mps)?;
+    number("speed_sd_mps", speed.sd_mps, |sd| sd >= 0.0 && sd <= speed.max_mps - speed.min_mps)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use crate::scenario::{Override, Scenario, decode, embedded_names, encode, load, load_embedded};
+
+    #[test]
+    fn what_the_loader_makes_is_sound() {
+        for name in embedded_names() {
+            for seed in [1, 2, 3] {
+                assert_eq!(load_embedded(name, &[], Some(seed)).unwrap().check(), Ok(()), "{name}");
+            }
+        }
+        let sets =
+            ["controllers=[{name=\"a\",zones=[\"merge-1\"]},{name=\"b\",approaches=[\"merge-2.main\"]}]"];
+        let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
+        assert_eq!(load(None, &sets, None).unwrap().check(), Ok(()));
+        assert_eq!(crate::bench::corridors(500, 60.0).unwrap().check(), Ok(()));
+    }
+
+    #[test]
+    fn what_it_would_refuse_is_not() {
+        let sound = load_embedded("two-merges", &[], None).unwrap();
+        let spoil: [fn(&mut Scenario); 14] = [
+            |s| s.dt_ns = 0,
+            |s| s.max_time_s = f64::NAN,
+            |s| s.beta = 0.0,
+            |s| s.vehicle.v_max_mps = f64::INFINITY,
+            |s| s.vehicle.u_min_mps2 = 1.0,
+            |s| s.control.fe_fraction = 2.0,
+            |s| s.network.zones.clear(),
+            |s| s.network.zones[0].approaches.clear(),
+            |s| s.network.zones[1].approaches[0].length_m = 0.0,
+            |s| s.network.zones.swap(0, 1),
+            |s| s.network.roads[0].zone = 99,
+            |s| {
+                s.network.roads.pop();
+            },
+            |s| {
+                s.network.roads[0].demand = crate::scenario::Demand::Trace(vec![crate::scenario::Arrival {
+                    time_s: -1.0,
+                    speed_mps: 9.0,
+                }])
+            },
+            |s| {
+                let approaches = vec![(7, 0)];
+                s.plugins = vec![crate::scenario::Plugin { name: "p".into(), approaches, command: None }];
+            },
+        ];
+        for (i, spoil) in spoil.into_iter().enumerate() {
+            let mut scenario = sound.clone();
+            spoil(&mut scenario);
+            assert!(scenario.check().is_err(), "number {i} passed");
+        }
+    }
+
+    #[test]
+    fn a_scenario_with_any_wrong_byte_is_refused_or_can_be_run() {
+        use crate::lockstep::in_process::InProcess;
+        use std::sync::Arc;
+        let bytes = encode(&load_embedded("tree", &[], None).unwrap());
+        let mut run = 0;
+        for i in 0..bytes.len() {
+            for flip in [0x01, 0x80, 0xff] {
+                let mut wrong = bytes.clone();
+                wrong[i] ^= flip;
+                let Ok(scenario) = decode(&wrong) else { continue };
+                if scenario.check().is_err() || scenario.dt_s() > 60.0 {
+                    continue;
+                }
+                let mut process = InProcess::new(&Arc::new(scenario), 1, 1);
+                for _ in 0..3 {
+                    // What goes wrong must be an error, not a panic.
+                    if !matches!(process.step(), Ok(true)) {
+                        break;
+                    }
+                }
+                run += 1;
+            }
+        }
+        assert!(run > 100, "only {run} scenarios were run");
+    }
+}
