@@ -104,6 +104,7 @@ fn peer(args: &PeerArgs) -> Result<(), AppError> {
     let kind = match args.kind.as_str() {
         "word" => PeerKind::Word { path: text(0)?, count: number(1)? },
         "iceoryx2" => PeerKind::Iceoryx2 { run: text(0)?.parse().map_err(|_| bad())?, count: number(1)? },
+        "step" => PeerKind::Step { run: text(0)?.parse().map_err(|_| bad())? },
         "unix" => PeerKind::Unix { path: text(0)? },
         "tcp" => PeerKind::Tcp { port: u16::try_from(number(0)?).map_err(|_| bad())? },
         _ => return Err(bad()),
@@ -163,6 +164,8 @@ fn latency_table(r: &LatencyReport) -> String {
     row("event step in one process", &r.in_process_event_step);
     row("step, three processes (ours)", &r.steady_step);
     row("event step, three processes", &r.event_step);
+    row("step, two processes", &r.two_process_step);
+    row("event step, two processes", &r.two_process_event_step);
     row("step over a unix socket", &r.unix_socket_step);
     row("step over TCP", &r.tcp_step);
     align(&mut table);

@@ -8,6 +8,7 @@ mod scale;
 mod shared_word;
 mod socket;
 mod solver;
+mod step;
 
 pub use corridors::corridors;
 pub use latency::{LatencyOptions, LatencyReport, latency};

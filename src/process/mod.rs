@@ -18,7 +18,8 @@ pub use run_spec::plugin_bytes;
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
-    LatencyUs, Outcome, Percentiles, WorldOptions, check_cores, new_histogram, run_in_process, run_world,
+    LatencyUs, Outcome, Percentiles, WARM_UP_STEPS, WorldOptions, check_cores, expected_vehicles,
+    new_histogram, run_in_process, run_world,
 };
 
 use crate::lockstep::{Awaited, LockstepError};
