@@ -178,21 +178,38 @@ fn latency_table(r: &LatencyReport) -> String {
 }
 
 fn solver_table(r: &SolverReport) -> String {
-    format!(
-        "{}\n{}: {} QPs ({} infeasible), {} vehicle-steps\n\
-         closed form      {:>10.1} ns per QP\n\
-         Clarabel, fresh  {:>10.1} ns per QP, {:.0} times as long; greatest difference {:.1e} m/s²\n\
-         whole controller {:>10.1} ns per vehicle-step\n",
-        r.machine,
-        r.scenario,
-        r.programs,
-        r.infeasible,
-        r.vehicle_steps,
-        r.closed_form_ns,
+    let counts = r.instructions.as_ref();
+    let mut table = table(&["", "ns", "instructions", "times the closed form", "difference [m/s²]"]);
+    let mut row = |name: &str, ns: f64, count: Option<f64>, ratio: Option<f64>, difference: Option<f64>| {
+        let or_none = |text: Option<String>| text.unwrap_or_default();
+        table.add_row([
+            name.to_owned(),
+            format!("{ns:.1}"),
+            count.map_or_else(|| "not available".to_owned(), |n| format!("{n:.0}")),
+            or_none(ratio.map(|x| format!("{x:.0}"))),
+            or_none(difference.map(|x| format!("{x:.1e}"))),
+        ]);
+    };
+    row("closed form, per QP", r.closed_form_ns, counts.map(|c| c.closed_form), None, None);
+    row(
+        "Clarabel, fresh, per QP",
         r.clarabel_ns,
-        r.ratio,
-        r.greatest_difference_mps2,
-        r.controller_ns
+        counts.map(|c| c.clarabel),
+        Some(r.ratio),
+        Some(r.greatest_difference_fresh_mps2),
+    );
+    row(
+        "Clarabel, updated, per QP",
+        r.clarabel_updated_ns,
+        counts.map(|c| c.clarabel_updated),
+        Some(r.ratio_updated),
+        Some(r.greatest_difference_updated_mps2),
+    );
+    row("whole controller, per vehicle-step", r.controller_ns, counts.map(|c| c.controller), None, None);
+    align(&mut table);
+    format!(
+        "{}\n{}: {} QPs ({} infeasible), {} vehicle-steps; the updated solver has {} rows\n{table}\n",
+        r.machine, r.scenario, r.programs, r.infeasible, r.vehicle_steps, r.updated_rows
     )
 }
 

@@ -1,6 +1,7 @@
 //! Measurements a user runs on their own machine: `cz bench`.
 
 mod corridors;
+mod instructions;
 mod latency;
 mod machine;
 mod peer;
