@@ -61,7 +61,7 @@ pub(super) enum BenchKind {
     /// The closed-form QP next to Clarabel, and the whole controller.
     Solver(MeasureArgs),
     /// Step time from a hundred to a hundred thousand vehicles.
-    Scale(MeasureArgs),
+    Scale(ScaleArgs),
     /// The other process of a measurement.
     #[command(hide = true)]
     Peer(PeerArgs),
@@ -75,6 +75,16 @@ pub(super) struct MeasureArgs {
     /// Also write the results as JSON to this file; `-` for stdout, which then holds nothing else.
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct ScaleArgs {
+    #[command(flatten)]
+    pub measure: MeasureArgs,
+    /// Also measure SUMO's stepping, with its human drivers on the same corridors. Needs the Python package
+    /// eclipse-sumo in the Python that CZ_PYTHON names (default: python3).
+    #[arg(long)]
+    pub with_sumo: bool,
 }
 
 #[derive(Debug, Args)]

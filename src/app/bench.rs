@@ -4,7 +4,7 @@ use super::args::{BenchArgs, BenchKind, PeerArgs, ScenarioArgs, ShareArgs, WaitA
 use super::supervise::{Plan, supervise};
 use super::{AppError, print};
 use crate::bench::{
-    self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport,
+    self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport, Sumo,
 };
 use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, run_in_process};
 use crate::transport::iox::RunName;
@@ -16,7 +16,10 @@ use std::time::Duration;
 
 impl From<BenchError> for AppError {
     fn from(error: BenchError) -> AppError {
-        AppError::Failed(error.to_string())
+        match error {
+            BenchError::NoSumo { .. } => AppError::Usage(error.to_string()),
+            other => AppError::Failed(other.to_string()),
+        }
     }
 }
 
@@ -32,8 +35,8 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
             deliver(args.json.as_deref(), &report, &solver_table(&report))
         }
         BenchKind::Scale(args) => {
-            let report = scale(args.quick)?;
-            deliver(args.json.as_deref(), &report, &scale_table(&report))
+            let report = scale(args.measure.quick, args.with_sumo)?;
+            deliver(args.measure.json.as_deref(), &report, &scale_table(&report))
         }
         BenchKind::Peer(args) => peer(args),
     }
@@ -112,7 +115,12 @@ fn peer(args: &PeerArgs) -> Result<(), AppError> {
     Ok(bench::run_peer(&kind, &scenario)?)
 }
 
-fn scale(quick: bool) -> Result<ScaleReport, AppError> {
+/// Vehicles from which on SUMO's clock is fine enough.
+const SUMO_FROM: usize = 1_000;
+
+fn scale(quick: bool, with_sumo: bool) -> Result<ScaleReport, AppError> {
+    // First, so that a missing package is said before minutes have passed.
+    let sumo = if with_sumo { Some((Sumo::find()?, SUMO_FROM)) } else { None };
     let sizes = if quick { vec![100, 1_000] } else { vec![100, 1_000, 10_000, 100_000] };
     let run = |size: usize, controllers: u32| {
         let arguments = ScenarioArgs { scenario: None, seed: None, set: vec![], corridors: Some(size) };
@@ -122,7 +130,7 @@ fn scale(quick: bool) -> Result<ScaleReport, AppError> {
         }
         run_processes(&arguments, controllers)
     };
-    Ok(bench::scale(&ScaleOptions { sizes, run: &run }, |point| {
+    Ok(bench::scale(&ScaleOptions { sizes, run: &run, sumo }, |point| {
         eprintln!("{} vehicles, {} controllers: {} ns", point.vehicles, point.controllers, point.step_ns);
     })?)
 }
@@ -231,5 +239,22 @@ fn scale_table(r: &ScaleReport) -> String {
     for (controllers, exponent) in &r.growth_exponents {
         text.push_str(&format!("growth exponent, {controllers} controller processes: {exponent:.3}\n"));
     }
+    if let Some(version) = &r.sumo_version {
+        text.push_str(&sumo_table(r, version));
+    }
     text
+}
+
+fn sumo_table(r: &ScaleReport, version: &str) -> String {
+    let mut table = table(&["vehicles", "SUMO, ns per vehicle-step", "ours", "SUMO / ours"]);
+    for p in &r.sumo {
+        table.add_row([
+            format!("{:.0} / {}", p.vehicles, p.our_vehicles),
+            format!("{:.1}", p.ns_per_vehicle_step),
+            format!("{:.1}", p.our_ns_per_vehicle_step),
+            format!("{:.2}", p.ratio),
+        ]);
+    }
+    align(&mut table);
+    format!("SUMO {version} with human drivers, beside ours in one process; one thread each\n{table}\n")
 }
