@@ -251,6 +251,9 @@ pub(super) struct WaitArgs {
     /// Pin the processes to cores.
     #[arg(long, value_enum, default_value_t = Placement::None)]
     pub pin: Placement,
+    /// Ask for real-time scheduling (SCHED_FIFO) and locked memory, and say what was granted.
+    #[arg(long)]
+    pub rt: bool,
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {
@@ -265,7 +268,7 @@ pub(super) struct RunArgs {
     #[command(flatten)]
     pub scenario: ScenarioArgs,
     /// Run everything in this process, without shared memory.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "rt")]
     pub in_process: bool,
     #[command(flatten)]
     pub share: ShareArgs,

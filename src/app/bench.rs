@@ -63,6 +63,7 @@ const WAIT: WaitArgs = WaitArgs {
     attach_timeout: Duration::from_secs(30),
     peer_timeout: Duration::from_secs(30),
     pin: Placement::Auto,
+    rt: false,
 };
 
 fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, String> {

@@ -1,7 +1,7 @@
 //! The summary of a run: as JSON, and as a table for people.
 
 use super::{AppError, print};
-use crate::process::{LatencyUs, Outcome};
+use crate::process::{LatencyUs, Outcome, Settled};
 use crate::scenario::{Scenario, ShieldMode};
 use crate::world::{ShieldSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
@@ -28,6 +28,10 @@ pub(super) struct Summary {
     held_arrivals: u32,
     waiting: u32,
     shield: ShieldSummary,
+    placement: Vec<Settled>,
+    /// Whether the table says so too: somebody has asked for something.
+    #[serde(skip)]
+    show_placement: bool,
 }
 
 /// How the frames of a run travelled.
@@ -62,7 +66,14 @@ impl Summary {
             held_arrivals: world.held_arrivals,
             waiting: world.waiting,
             shield: world.shield,
+            placement: outcome.placement,
+            show_placement: false,
         }
+    }
+
+    /// Has the table say where each process was and what it was granted.
+    pub fn with_placement(self, show_placement: bool) -> Summary {
+        Summary { show_placement, ..self }
     }
 
     /// Prints the table, or writes the JSON, or both.
@@ -146,6 +157,9 @@ impl Summary {
             ));
         }
         shield_lines(&self.shield, &mut text);
+        for settled in self.placement.iter().filter(|_| self.show_placement) {
+            text.push_str(&format!("{settled}\n"));
+        }
         text.push_str(&format!("state hash {}\n", self.state_hash));
         text
     }

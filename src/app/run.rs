@@ -4,7 +4,7 @@ use super::args::RunArgs;
 use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
 use super::{AppError, controllers};
-use crate::process::{StopFlag, WaitMode, check_cores, run_in_process};
+use crate::process::{Placement, StopFlag, WaitMode, check_cores, run_in_process};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::World;
@@ -46,7 +46,8 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
     };
     bar.finish();
-    Summary::new(&scenario, transport, outcome?).deliver(args.json.as_deref())
+    let asked = args.wait.rt || args.wait.pin != Placement::None;
+    Summary::new(&scenario, transport, outcome?).with_placement(asked).deliver(args.json.as_deref())
 }
 
 /// A run name nobody else has.

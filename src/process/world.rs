@@ -1,7 +1,7 @@
 //! The world process.
 
 use super::attach::Reception;
-use super::{Patience, ProcessError, StopFlag, WaitMode, Waiter};
+use super::{Patience, ProcessError, Settled, StopFlag, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Progress, WorldDriver, WorldPorts};
 use crate::scenario::Scenario;
@@ -59,6 +59,9 @@ pub struct Outcome {
     pub event_ns: Percentiles,
     /// Peak resident memory of the process, bytes (0 where it cannot be known).
     pub peak_rss_bytes: u64,
+    /// Where each process was and what it was granted; filled in by who started them.
+    #[serde(default)]
+    pub placement: Vec<Settled>,
 }
 
 /// Peak resident memory of this process, bytes.
@@ -166,6 +169,7 @@ impl StepMeter {
             steady_ns: Percentiles::of(&self.steady_ns),
             event_ns: Percentiles::of(&self.event_ns),
             peak_rss_bytes: peak_rss_bytes(),
+            placement: Vec::new(),
         }
     }
 }
