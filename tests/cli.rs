@@ -206,3 +206,19 @@ fn a_scenario_file_may_be_anywhere() {
     assert_eq!(common::hash(&processes), common::hash(&in_process));
     site.assert_clean();
 }
+
+#[test]
+fn bench_says_what_to_install_where_sumo_is_missing() {
+    for python in ["/bin/false", "/no/such/python"] {
+        let output = cz(&["bench", "scale", "--quick", "--with-sumo"])
+            .env("CZ_PYTHON", python)
+            .assert()
+            .code(2)
+            .get_output()
+            .clone();
+        let message = String::from_utf8(output.stderr).unwrap();
+        for word in [python, "eclipse-sumo", "pip install", "CZ_PYTHON"] {
+            assert!(message.contains(word), "no {word:?} in {message}");
+        }
+    }
+}

@@ -192,6 +192,31 @@ proptest! {
     }
 }
 
+/// Some programs one after the other, one in four without a feasible point.
+fn sequences() -> impl Strategy<Value = Vec<(Tracking, Program)>> {
+    let programs = prop_oneof![3 => feasible_programs().boxed(), 1 => infeasible_programs().boxed()];
+    prop::collection::vec((trackings(), programs), 1..20)
+}
+
+proptest! {
+    #![proptest_config(cases(400))]
+
+    /// A solver that is given one program after another forgets each before the next.
+    #[test]
+    fn a_reused_solver_answers_each_program_like_the_closed_form(sequence in sequences()) {
+        let longest = sequence.iter().map(|(_, program)| program.list().len()).max().unwrap_or(0);
+        let mut reused = clarabel::Reused::new(longest);
+        for (tracking, program) in &sequence {
+            match (qp::solve(tracking, &program.interval()), reused.solve(tracking, &program.list())) {
+                (Some(u), Some(reference)) => {
+                    prop_assert!((u - reference).abs() <= 1e-6, "closed form {u}, Clarabel {reference}");
+                }
+                (ours, theirs) => prop_assert_eq!(ours, theirs),
+            }
+        }
+    }
+}
+
 /// The row that sets an end is the one reported, and the first of equals.
 #[test]
 fn interval_names_the_rows_that_set_its_ends() {

@@ -67,10 +67,8 @@ fn disturb(
 
 fn send_if_alive(id: u32) {
     if common::is_alive(id) {
-        let _ = rustix::process::kill_process(
-            rustix::process::Pid::from_raw(id as i32).unwrap(),
-            Signal::KILL,
-        );
+        let _ =
+            rustix::process::kill_process(rustix::process::Pid::from_raw(id as i32).unwrap(), Signal::KILL);
     }
 }
 

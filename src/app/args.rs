@@ -67,7 +67,7 @@ pub(super) enum BenchKind {
     /// The closed-form QP next to Clarabel, and the whole controller.
     Solver(MeasureArgs),
     /// Step time from a hundred to a hundred thousand vehicles.
-    Scale(MeasureArgs),
+    Scale(ScaleArgs),
     /// The other process of a measurement.
     #[command(hide = true)]
     Peer(PeerArgs),
@@ -81,6 +81,16 @@ pub(super) struct MeasureArgs {
     /// Also write the results as JSON to this file; `-` for stdout, which then holds nothing else.
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct ScaleArgs {
+    #[command(flatten)]
+    pub measure: MeasureArgs,
+    /// Also measure SUMO's stepping, with its human drivers on the same corridors. Needs the Python package
+    /// eclipse-sumo in the Python that CZ_PYTHON names (default: python3).
+    #[arg(long)]
+    pub with_sumo: bool,
 }
 
 #[derive(Debug, Args)]
@@ -247,6 +257,9 @@ pub(super) struct WaitArgs {
     /// Pin the processes to cores.
     #[arg(long, value_enum, default_value_t = Placement::None)]
     pub pin: Placement,
+    /// Ask for real-time scheduling (SCHED_FIFO) and locked memory, and say what was granted.
+    #[arg(long)]
+    pub rt: bool,
 }
 
 fn seconds(text: &str) -> Result<Duration, String> {
@@ -270,7 +283,7 @@ pub(super) struct RunArgs {
     #[command(flatten)]
     pub scenario: ScenarioArgs,
     /// Run everything in this process, without shared memory.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "rt")]
     pub in_process: bool,
     #[command(flatten)]
     pub share: ShareArgs,

@@ -4,7 +4,7 @@ use super::args::{BenchArgs, BenchKind, PeerArgs, Restart, ScenarioArgs, ShareAr
 use super::supervise::{Plan, supervise};
 use super::{AppError, print};
 use crate::bench::{
-    self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport,
+    self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport, Sumo,
 };
 use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, run_in_process};
 use crate::transport::iox::RunName;
@@ -16,7 +16,10 @@ use std::time::Duration;
 
 impl From<BenchError> for AppError {
     fn from(error: BenchError) -> AppError {
-        AppError::Failed(error.to_string())
+        match error {
+            BenchError::NoSumo { .. } => AppError::Usage(error.to_string()),
+            other => AppError::Failed(other.to_string()),
+        }
     }
 }
 
@@ -32,8 +35,8 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
             deliver(args.json.as_deref(), &report, &solver_table(&report))
         }
         BenchKind::Scale(args) => {
-            let report = scale(args.quick)?;
-            deliver(args.json.as_deref(), &report, &scale_table(&report))
+            let report = scale(args.measure.quick, args.with_sumo)?;
+            deliver(args.measure.json.as_deref(), &report, &scale_table(&report))
         }
         BenchKind::Peer(args) => peer(args),
     }
@@ -60,6 +63,7 @@ const WAIT: WaitArgs = WaitArgs {
     attach_timeout: Duration::from_secs(30),
     peer_timeout: Duration::from_secs(30),
     pin: Placement::Auto,
+    rt: false,
 };
 
 fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, String> {
@@ -105,6 +109,7 @@ fn peer(args: &PeerArgs) -> Result<(), AppError> {
     let kind = match args.kind.as_str() {
         "word" => PeerKind::Word { path: text(0)?, count: number(1)? },
         "iceoryx2" => PeerKind::Iceoryx2 { run: text(0)?.parse().map_err(|_| bad())?, count: number(1)? },
+        "step" => PeerKind::Step { run: text(0)?.parse().map_err(|_| bad())? },
         "unix" => PeerKind::Unix { path: text(0)? },
         "tcp" => PeerKind::Tcp { port: u16::try_from(number(0)?).map_err(|_| bad())? },
         _ => return Err(bad()),
@@ -112,7 +117,12 @@ fn peer(args: &PeerArgs) -> Result<(), AppError> {
     Ok(bench::run_peer(&kind, &scenario)?)
 }
 
-fn scale(quick: bool) -> Result<ScaleReport, AppError> {
+/// Vehicles from which on SUMO's clock is fine enough.
+const SUMO_FROM: usize = 1_000;
+
+fn scale(quick: bool, with_sumo: bool) -> Result<ScaleReport, AppError> {
+    // First, so that a missing package is said before minutes have passed.
+    let sumo = if with_sumo { Some((Sumo::find()?, SUMO_FROM)) } else { None };
     let sizes = if quick { vec![100, 1_000] } else { vec![100, 1_000, 10_000, 100_000] };
     let run = |size: usize, controllers: u32| {
         let arguments = ScenarioArgs { scenario: None, seed: None, set: vec![], corridors: Some(size) };
@@ -122,7 +132,7 @@ fn scale(quick: bool) -> Result<ScaleReport, AppError> {
         }
         run_processes(&arguments, controllers)
     };
-    Ok(bench::scale(&ScaleOptions { sizes, run: &run }, |point| {
+    Ok(bench::scale(&ScaleOptions { sizes, run: &run, sumo }, |point| {
         eprintln!("{} vehicles, {} controllers: {} ns", point.vehicles, point.controllers, point.step_ns);
     })?)
 }
@@ -164,6 +174,8 @@ fn latency_table(r: &LatencyReport) -> String {
     row("event step in one process", &r.in_process_event_step);
     row("step, three processes (ours)", &r.steady_step);
     row("event step, three processes", &r.event_step);
+    row("step, two processes", &r.two_process_step);
+    row("event step, two processes", &r.two_process_event_step);
     row("step over a unix socket", &r.unix_socket_step);
     row("step over TCP", &r.tcp_step);
     align(&mut table);
@@ -176,21 +188,38 @@ fn latency_table(r: &LatencyReport) -> String {
 }
 
 fn solver_table(r: &SolverReport) -> String {
-    format!(
-        "{}\n{}: {} QPs ({} infeasible), {} vehicle-steps\n\
-         closed form      {:>10.1} ns per QP\n\
-         Clarabel, fresh  {:>10.1} ns per QP, {:.0} times as long; greatest difference {:.1e} m/s²\n\
-         whole controller {:>10.1} ns per vehicle-step\n",
-        r.machine,
-        r.scenario,
-        r.programs,
-        r.infeasible,
-        r.vehicle_steps,
-        r.closed_form_ns,
+    let counts = r.instructions.as_ref();
+    let mut table = table(&["", "ns", "instructions", "times the closed form", "difference [m/s²]"]);
+    let mut row = |name: &str, ns: f64, count: Option<f64>, ratio: Option<f64>, difference: Option<f64>| {
+        let or_none = |text: Option<String>| text.unwrap_or_default();
+        table.add_row([
+            name.to_owned(),
+            format!("{ns:.1}"),
+            count.map_or_else(|| "not available".to_owned(), |n| format!("{n:.0}")),
+            or_none(ratio.map(|x| format!("{x:.0}"))),
+            or_none(difference.map(|x| format!("{x:.1e}"))),
+        ]);
+    };
+    row("closed form, per QP", r.closed_form_ns, counts.map(|c| c.closed_form), None, None);
+    row(
+        "Clarabel, fresh, per QP",
         r.clarabel_ns,
-        r.ratio,
-        r.greatest_difference_mps2,
-        r.controller_ns
+        counts.map(|c| c.clarabel),
+        Some(r.ratio),
+        Some(r.greatest_difference_fresh_mps2),
+    );
+    row(
+        "Clarabel, updated, per QP",
+        r.clarabel_updated_ns,
+        counts.map(|c| c.clarabel_updated),
+        Some(r.ratio_updated),
+        Some(r.greatest_difference_updated_mps2),
+    );
+    row("whole controller, per vehicle-step", r.controller_ns, counts.map(|c| c.controller), None, None);
+    align(&mut table);
+    format!(
+        "{}\n{}: {} QPs ({} infeasible), {} vehicle-steps; the updated solver has {} rows\n{table}\n",
+        r.machine, r.scenario, r.programs, r.infeasible, r.vehicle_steps, r.updated_rows
     )
 }
 
@@ -212,5 +241,22 @@ fn scale_table(r: &ScaleReport) -> String {
     for (controllers, exponent) in &r.growth_exponents {
         text.push_str(&format!("growth exponent, {controllers} controller processes: {exponent:.3}\n"));
     }
+    if let Some(version) = &r.sumo_version {
+        text.push_str(&sumo_table(r, version));
+    }
     text
+}
+
+fn sumo_table(r: &ScaleReport, version: &str) -> String {
+    let mut table = table(&["vehicles", "SUMO, ns per vehicle-step", "ours", "SUMO / ours"]);
+    for p in &r.sumo {
+        table.add_row([
+            format!("{:.0} / {}", p.vehicles, p.our_vehicles),
+            format!("{:.1}", p.ns_per_vehicle_step),
+            format!("{:.1}", p.our_ns_per_vehicle_step),
+            format!("{:.2}", p.ratio),
+        ]);
+    }
+    align(&mut table);
+    format!("SUMO {version} with human drivers, beside ours in one process; one thread each\n{table}\n")
 }

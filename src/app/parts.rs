@@ -1,10 +1,12 @@
 //! `cz world`, `cz coord`, `cz ctrl`: one process of a run.
 
 use super::AppError;
-use super::args::{PartArgs, Restart, WorldArgs};
+use super::args::{PartArgs, Restart, WaitArgs, WorldArgs};
 use super::report::{Summary, Transport};
-use super::supervise::WorldLine;
-use crate::process::{Joining, StopFlag, WorldOptions, place, run_controller, run_coordinator, run_world};
+use super::supervise::{SettledLine, WorldLine};
+use crate::process::{
+    Joining, Settled, Settling, StopFlag, WorldOptions, run_controller, run_coordinator, run_world,
+};
 use crate::scenario::scenario_hash;
 use crate::world::World;
 use ipc_schemas::Role;
@@ -29,7 +31,9 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         wait: args.wait_mode,
         replace: args.restart == Restart::OnFailure,
     };
-    place(args.wait.pin, Role::World, 0);
+    let hot_processes = args.wait_mode.hot_processes(options.coordinators, options.controllers);
+    let report = report_to(args.supervised, &args.wait);
+    settling(&args.wait, &*report).settle(Role::World, 0, args.wait_mode, hot_processes);
     if args.supervised.is_some() {
         let mut last = Instant::now();
         let outcome = run_world(&scenario, &options, &stop, |world| {
@@ -48,12 +52,30 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
 
 pub(super) fn coordinator(args: &PartArgs) -> Result<(), AppError> {
     let (joining, stop) = prepare(args, Role::Coordinator)?;
-    Ok(run_coordinator(&args.run, joining, args.wait.peer_timeout, args.wait.pin, &stop)?)
+    let report = report_to(args.supervised, &args.wait);
+    let settling = settling(&args.wait, &*report);
+    Ok(run_coordinator(&args.run, joining, args.wait.peer_timeout, &settling, &stop)?)
 }
 
 pub(super) fn controller(args: &PartArgs) -> Result<(), AppError> {
     let (joining, stop) = prepare(args, Role::Controller)?;
-    Ok(run_controller(&args.run, joining, args.wait.peer_timeout, args.wait.pin, &stop)?)
+    let report = report_to(args.supervised, &args.wait);
+    let settling = settling(&args.wait, &*report);
+    Ok(run_controller(&args.run, joining, args.wait.peer_timeout, &settling, &stop)?)
+}
+
+fn settling<'a>(wait: &WaitArgs, report: &'a dyn Fn(&Settled)) -> Settling<'a> {
+    Settling { pin: wait.pin, realtime: wait.rt, report }
+}
+
+/// Where what was granted is said: to the supervisor, which always wants it, as a line it recognises; to
+/// people when they have asked.
+fn report_to(supervisor: Option<u32>, wait: &WaitArgs) -> Box<dyn Fn(&Settled)> {
+    match (supervisor, wait.rt) {
+        (Some(_), _) => Box::new(|settled| eprintln!("{}", SettledLine(settled.clone()).to_line())),
+        (None, true) => Box::new(|settled| eprintln!("{settled}")),
+        (None, false) => Box::new(|_| {}),
+    }
 }
 
 fn prepare(args: &PartArgs, role: Role) -> Result<(Joining, StopFlag), AppError> {

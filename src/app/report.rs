@@ -2,7 +2,7 @@
 
 use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
-use crate::process::{LatencyUs, Outcome, Replacement};
+use crate::process::{LatencyUs, Outcome, Replacement, Settled};
 use crate::scenario::{Scenario, ShieldMode};
 use crate::world::{ShieldSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
@@ -32,6 +32,10 @@ pub(super) struct Summary {
     replacements: Vec<Replacement>,
     refused: Vec<RefusedFrames>,
     late_frames: u64,
+    placement: Vec<Settled>,
+    /// Whether the table says so too: somebody has asked for something.
+    #[serde(skip)]
+    show_placement: bool,
 }
 
 /// How the frames of a run travelled.
@@ -69,7 +73,14 @@ impl Summary {
             replacements: outcome.replacements,
             refused: outcome.refused,
             late_frames: outcome.late_frames,
+            placement: outcome.placement,
+            show_placement: false,
         }
+    }
+
+    /// Has the table say where each process was and what it was granted.
+    pub fn with_placement(self, show_placement: bool) -> Summary {
+        Summary { show_placement, ..self }
     }
 
     /// Prints the table, or writes the JSON, or both.
@@ -161,6 +172,9 @@ impl Summary {
         }
         for r in &self.refused {
             text.push_str(&format!("refused {} frames of {}; the last: {}\n", r.frames, r.sender, r.last));
+        }
+        for settled in self.placement.iter().filter(|_| self.show_placement) {
+            text.push_str(&format!("{settled}\n"));
         }
         text.push_str(&format!("state hash {}\n", self.state_hash));
         text

@@ -6,7 +6,7 @@ use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
 use super::{AppError, controllers};
 use crate::lockstep::in_process::InProcess;
-use crate::process::{StopFlag, WaitMode, check_cores, run_in_process, run_in_process_observed};
+use crate::process::{Placement, StopFlag, WaitMode, check_cores, run_in_process, run_in_process_observed};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::World;
@@ -66,7 +66,8 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
     };
     bar.finish();
-    Summary::new(&scenario, transport, outcome?).deliver(args.json.as_deref())?;
+    let asked = args.wait.rt || args.wait.pin != Placement::None;
+    Summary::new(&scenario, transport, outcome?).with_placement(asked).deliver(args.json.as_deref())?;
     // A recording that failed does not take the results with it.
     recorded
 }

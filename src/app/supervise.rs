@@ -3,7 +3,7 @@
 use super::AppError;
 use super::args::{Restart, ScenarioArgs, ShareArgs, WaitArgs};
 use super::run::Position;
-use crate::process::{Outcome, ProcessError, WaitMode};
+use crate::process::{Outcome, ProcessError, Settled, WaitMode};
 use crate::scenario::Plugin;
 use crate::transport::iox::{RunName, RunSpace};
 use crate::world::World;
@@ -27,6 +27,23 @@ pub(super) enum WorldLine {
 impl WorldLine {
     pub fn progress(world: &World) -> WorldLine {
         WorldLine::Progress(Position::of(world))
+    }
+}
+
+/// What each process says on stderr before its run begins: where it is and what it was granted.
+#[derive(Debug)]
+pub(super) struct SettledLine(pub Settled);
+
+impl SettledLine {
+    /// Sets the line apart from everything else that is said on stderr.
+    const MARK: &str = "cz-settled ";
+
+    pub fn to_line(&self) -> String {
+        format!("{}{}", Self::MARK, serde_json::to_string(&self.0).expect("it has string keys only"))
+    }
+
+    fn of(line: &str) -> Option<SettledLine> {
+        serde_json::from_str(line.strip_prefix(Self::MARK)?).ok().map(SettledLine)
     }
 }
 
@@ -137,6 +154,8 @@ struct Member {
     since: Instant,
     /// The last thing it said on stderr.
     last_words: Option<String>,
+    /// Where it is and what it was granted.
+    settled: Option<Settled>,
 }
 
 impl Family {
@@ -148,6 +167,7 @@ impl Family {
         let name =
             |v: Option<clap::builder::PossibleValue>| v.map_or_else(String::new, |v| v.get_name().to_owned());
         common.extend(["--pin".to_owned(), name(plan.wait.pin.to_possible_value())]);
+        common.extend(plan.wait.rt.then(|| "--rt".to_owned()));
         common.extend(["--supervised".to_owned(), std::process::id().to_string()]);
         let mut world = common.clone();
         world.extend(["--ctrl-procs".to_owned(), plan.share.ctrl_procs.to_string()]);
@@ -194,6 +214,7 @@ impl Family {
             part: None,
             since: Instant::now(),
             last_words: None,
+            settled: None,
         };
         self.children.push(member);
         let prefix = name.to_owned();
@@ -228,6 +249,7 @@ impl Family {
             part: Some(part),
             since: Instant::now(),
             last_words: None,
+            settled: None,
         });
         self.listen(index, &mut child);
         Ok(())
@@ -311,6 +333,10 @@ impl Family {
                     Event::Line { line: WorldLine::Progress(position) } => progress(position),
                     Event::Line { line: WorldLine::Outcome(result) } => outcome = Some(*result),
                     Event::Said { child, line } => {
+                        if let Some(SettledLine(settled)) = SettledLine::of(&line) {
+                            self.children[child].settled = Some(settled);
+                            continue;
+                        }
                         if self.plugins.contains(&child) {
                             eprintln!("[{}] {line}", self.children[child].name);
                         }
@@ -342,7 +368,10 @@ impl Family {
         }
         match (failure, outcome) {
             (Some((error, _)), _) => Err(error),
-            (None, Some(outcome)) => Ok(outcome),
+            (None, Some(outcome)) => Ok(Outcome {
+                placement: self.children.iter_mut().filter_map(|c| c.settled.take()).collect(),
+                ..outcome
+            }),
             (None, None) => Err(AppError::Failed("the world ended without results".to_owned())),
         }
     }

@@ -4,18 +4,16 @@ use super::machine::Machine;
 use super::peer::{PATIENCE, receive};
 use super::shared_word::SharedWords;
 use super::socket::{Connection, Stream};
+use super::step::{Stepped, lead};
 use super::{BenchError, io};
-use crate::coordination::Coordinator;
-use crate::lockstep::{CoordinatorDriver, CoordinatorPorts, Identity, Progress, WorldDriver, WorldPorts};
 use crate::process::{
-    Affinity, Outcome, Percentiles, Placement, StopFlag, new_histogram, place, run_in_process, unplaced,
+    Affinity, Outcome, Percentiles, Placement, StopFlag, expected_vehicles, new_histogram, place,
+    run_in_process, unplaced,
 };
 use crate::scenario::Scenario;
 use crate::transport::iox::{RunName, RunSpace, ServiceLimits};
-use crate::transport::memory::{MemoryInbox, MemoryService};
 use crate::transport::{Frame, Loan, Outbox};
-use crate::world::World;
-use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState};
 use serde::Serialize;
 use std::hint::black_box;
 use std::net::TcpListener;
@@ -58,6 +56,11 @@ pub struct LatencyReport {
     pub steady_step: Percentiles,
     /// The same for steps in which the coordinator acts.
     pub event_step: Percentiles,
+    /// A step with two processes, the controller apart from world and coordinator; steps without
+    /// coordination.
+    pub two_process_step: Percentiles,
+    /// The same for steps in which the coordinator acts.
+    pub two_process_event_step: Percentiles,
     /// A step (without coordination) over a unix socket, two processes.
     pub unix_socket_step: Percentiles,
     /// The same over TCP on the loopback interface.
@@ -83,11 +86,15 @@ pub fn latency(options: &LatencyOptions<'_>) -> Result<LatencyReport, BenchError
     let floor = floor(options, affinity.as_ref())?;
     let iceoryx2 = iceoryx2(options, affinity.as_ref(), mean_records.round() as usize)?;
     let processes = unplaced(affinity.as_ref(), options.run_processes).map_err(BenchError::Run)?;
+    let two = iceoryx2_step(options, affinity.as_ref())?;
     let unix = socket_step(options, affinity.as_ref(), SocketKind::Unix)?;
     let tcp = socket_step(options, affinity.as_ref(), SocketKind::Tcp)?;
-    for (name, hash) in
-        [("three processes", processes.world.state_hash), ("unix socket", unix.1), ("tcp", tcp.1)]
-    {
+    for (name, hash) in [
+        ("three processes", processes.world.state_hash),
+        ("two processes", two.state_hash),
+        ("unix socket", unix.state_hash),
+        ("tcp", tcp.state_hash),
+    ] {
         if hash != in_process.world.state_hash {
             let expected = in_process.world.state_hash;
             return Err(BenchError::Disagreement(format!(
@@ -95,7 +102,7 @@ pub fn latency(options: &LatencyOptions<'_>) -> Result<LatencyReport, BenchError
             )));
         }
     }
-    let (unix, tcp) = (unix.0, tcp.0);
+    let (unix, tcp) = (unix.steady, tcp.steady);
     let ratio = |a: u64, b: u64| a as f64 / b.max(1) as f64;
     Ok(LatencyReport {
         machine,
@@ -107,6 +114,8 @@ pub fn latency(options: &LatencyOptions<'_>) -> Result<LatencyReport, BenchError
         in_process_event_step: in_process.event_ns,
         steady_step: processes.steady_ns,
         event_step: processes.event_ns,
+        two_process_step: two.steady,
+        two_process_event_step: two.event,
         unix_socket_step: unix,
         tcp_step: tcp,
         ratio_to_parts: ratio(processes.steady_ns.p50, in_process.steady_ns.p50 + iceoryx2.p50),
@@ -171,8 +180,7 @@ fn iceoryx2(
     affinity: Option<&Affinity>,
     records: usize,
 ) -> Result<Percentiles, BenchError> {
-    let run: RunName =
-        format!("bench-{}", std::process::id()).parse().expect("letters, a dash and digits are a run name");
+    let run = own_run("trip");
     let space = RunSpace::enter(&run)?;
     let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
     let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits)?;
@@ -220,7 +228,7 @@ fn socket_step(
     options: &LatencyOptions<'_>,
     affinity: Option<&Affinity>,
     kind: SocketKind,
-) -> Result<(Percentiles, u64), BenchError> {
+) -> Result<Stepped, BenchError> {
     let scenario = &options.scenario;
     let (stream, _peer) = match kind {
         SocketKind::Unix => {
@@ -244,41 +252,33 @@ fn socket_step(
         }
     };
     let connection = Connection::new(stream);
-    let mut coordinator_state: MemoryService<VehicleState> =
-        MemoryService::new();
-    let mut summaries: MemoryService<ZoneSummary> = MemoryService::new();
-    let zones = 0..scenario.network.zones.len() as u32;
-    let coordinator_ports = CoordinatorPorts::<_, MemoryInbox<ZoneSummary>, _, _> {
-        state: coordinator_state.inbox(),
-        summaries: summaries.inbox(),
-        neighbours:
-            Vec::<(u16, std::ops::Range<u32>, crate::transport::memory::MemoryOutbox<ZoneSummary>)>::new(),
-        coordination: connection.outbox::<Assignment>(),
-    };
-    let identity = Identity { run_id: 1, role: Role::Coordinator, index: 0, generation: 0 };
-    let mut coordinator =
-        CoordinatorDriver::new(Coordinator::new(scenario.clone(), zones), coordinator_ports, identity);
-    let ports = WorldPorts {
-        state: connection.outbox::<VehicleState>(),
-        coordinator_states: vec![coordinator_state.outbox()],
-        command: connection.inbox::<VehicleCommand>(),
-        coordination: None::<MemoryInbox<Assignment>>,
-    };
-    let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, 1, 1);
-    let mut steady = new_histogram();
-    let mut steps = 0;
-    loop {
-        let start = Instant::now();
-        if world.advance()? == Progress::Finished {
-            return Ok((Percentiles::of(&steady), world.world().state_hash()));
-        }
-        while coordinator.advance()? == Progress::Advanced {}
-        if world.advance()? == Progress::Finished {
-            return Ok((Percentiles::of(&steady), world.world().state_hash()));
-        }
-        steps += 1;
-        if steps > 500 && !world.was_event() {
-            let _ = steady.record(start.elapsed().as_nanos() as u64);
-        }
-    }
+    lead(
+        scenario,
+        connection.outbox::<VehicleState>(),
+        connection.outbox::<Assignment>(),
+        connection.inbox::<VehicleCommand>(),
+    )
+}
+
+/// World and coordinator here, the controller in another process, frames over iceoryx2.
+fn iceoryx2_step(options: &LatencyOptions<'_>, affinity: Option<&Affinity>) -> Result<Stepped, BenchError> {
+    let scenario = &options.scenario;
+    let run = own_run("step");
+    let space = RunSpace::enter(&run)?;
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
+    let expected = expected_vehicles(scenario);
+    let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits)?;
+    let mut commands = command.inbox()?;
+    let coordination = space.create::<Assignment>(frames::SERVICE_COORDINATION, limits)?;
+    let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits)?;
+    let (state, coordination) = (state.outbox(expected)?, coordination.outbox(2 * expected)?);
+    let _peer = start(options, affinity, &["step", &run.to_string()])?;
+    // An empty frame says that the other process has opened its ends.
+    drop(receive(&mut commands)?);
+    lead(scenario, state, coordination, commands)
+}
+
+/// A run name nobody else has.
+fn own_run(kind: &str) -> RunName {
+    format!("bench-{kind}-{}", std::process::id()).parse().expect("letters, dashes and digits are a run name")
 }

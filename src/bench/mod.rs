@@ -1,6 +1,7 @@
 //! Measurements a user runs on their own machine: `cz bench`.
 
 mod corridors;
+mod instructions;
 mod latency;
 mod machine;
 mod peer;
@@ -8,6 +9,8 @@ mod scale;
 mod shared_word;
 mod socket;
 mod solver;
+mod step;
+mod sumo;
 
 pub use corridors::corridors;
 pub use latency::{LatencyOptions, LatencyReport, latency};
@@ -15,6 +18,7 @@ pub use machine::Machine;
 pub use peer::{PeerKind, run_peer};
 pub use scale::{ScaleOptions, ScaleReport, scale};
 pub use solver::{SolverReport, solver};
+pub use sumo::{Sumo, SumoSide};
 
 use crate::lockstep::LockstepError;
 use crate::process::ProcessError;
@@ -46,6 +50,25 @@ pub enum BenchError {
     /// The other process did not do its part.
     #[error("the other process of the measurement ended early or does not answer")]
     Peer,
+    /// SUMO is not there.
+    #[error(
+        "no SUMO in {python} ({reason}); install it with `{python} -m pip install eclipse-sumo==1.28.0`, or \
+         name another Python in CZ_PYTHON"
+    )]
+    NoSumo {
+        /// The Python that was asked.
+        python: String,
+        /// What it said.
+        reason: String,
+    },
+    /// SUMO failed.
+    #[error("SUMO with {vehicles} vehicles: {reason}")]
+    Sumo {
+        /// Vehicles at once.
+        vehicles: usize,
+        /// What it said.
+        reason: String,
+    },
     /// A supervised run failed.
     #[error("{0}")]
     Run(String),

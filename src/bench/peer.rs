@@ -2,10 +2,11 @@
 
 use super::shared_word::SharedWords;
 use super::socket::{Connection, Stream};
+use super::step::{CONTROLLER, follow};
 use super::{BenchError, io};
 use crate::control::ControllerPool;
-use crate::lockstep::{ControllerDriver, ControllerPorts, Identity, Progress};
-use crate::process::{Placement, place};
+use crate::lockstep::{ControllerDriver, ControllerPorts};
+use crate::process::{Placement, expected_vehicles, place};
 use crate::scenario::Scenario;
 use crate::transport::iox::{RunName, RunSpace, SpaceError};
 use crate::transport::{Frame, Inbox, Loan, Outbox};
@@ -34,6 +35,11 @@ pub enum PeerKind {
         /// Round trips.
         count: u64,
     },
+    /// Control a scenario's vehicles over iceoryx2.
+    Step {
+        /// Run whose services are used.
+        run: RunName,
+    },
     /// Control a scenario's vehicles over a unix socket.
     Unix {
         /// Socket path.
@@ -55,6 +61,7 @@ pub fn run_peer(kind: &PeerKind, scenario: &Arc<Scenario>) -> Result<(), BenchEr
     match kind {
         PeerKind::Word { path, count } => SharedWords::open(Path::new(path))?.echo(*count),
         PeerKind::Iceoryx2 { run, count } => echo_frames(run, *count),
+        PeerKind::Step { run } => control_frames(run, scenario),
         PeerKind::Unix { path } => {
             control(Stream::Unix(UnixStream::connect(path).map_err(io("connect"))?), scenario)
         }
@@ -115,9 +122,24 @@ fn control(stream: Stream, scenario: &Arc<Scenario>) -> Result<(), BenchError> {
         coordination: connection.inbox::<Assignment>(),
         command: connection.outbox::<VehicleCommand>(),
     };
-    let zones = 0..scenario.network.zones.len() as u32;
-    let identity = Identity { run_id: 1, role: Role::Controller, index: 0, generation: 0 };
-    let mut driver = ControllerDriver::new(ControllerPool::new(scenario.clone(), zones), ports, identity, 0);
-    while driver.advance()? != Progress::Finished {}
-    Ok(())
+    follow(ControllerDriver::new(pool(scenario), ports, CONTROLLER, 0))
+}
+
+/// Controls a scenario's vehicles over iceoryx2.
+fn control_frames(run: &RunName, scenario: &Arc<Scenario>) -> Result<(), BenchError> {
+    // Everything exists before this process is started.
+    let space = RunSpace::enter(run)?;
+    let command = space.open(frames::SERVICE_COMMAND)?.outbox(expected_vehicles(scenario))?;
+    let mut ports = ControllerPorts {
+        state: space.open(frames::SERVICE_STATE)?.inbox()?,
+        coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
+        command,
+    };
+    // This says that the ends are open.
+    ports.command.loan(frames::FrameHeader::default(), 0, |_| {})?.send()?;
+    follow(ControllerDriver::new(pool(scenario), ports, CONTROLLER, 0))
+}
+
+fn pool(scenario: &Arc<Scenario>) -> ControllerPool {
+    ControllerPool::new(scenario.clone(), 0..scenario.network.zones.len() as u32)
 }

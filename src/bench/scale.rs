@@ -1,7 +1,7 @@
 //! `cz bench scale`: how the time of a step grows with the number of vehicles.
 
-use super::BenchError;
 use super::machine::Machine;
+use super::{BenchError, Sumo};
 use crate::process::Outcome;
 use nalgebra::{DMatrix, DVector};
 use serde::Serialize;
@@ -12,6 +12,8 @@ pub struct ScaleOptions<'a> {
     pub sizes: Vec<usize>,
     /// Runs a network of that many vehicles with that many controller processes (0: all in one process).
     pub run: &'a dyn Fn(usize, u32) -> Result<Outcome, String>,
+    /// SUMO, to be measured beside ours from this many vehicles on.
+    pub sumo: Option<(Sumo, usize)>,
 }
 
 /// One size and number of controller processes.
@@ -31,6 +33,24 @@ pub struct ScalePoint {
     pub world_bytes: u64,
 }
 
+/// SUMO beside ours, one thread each.
+///
+/// SUMO's human drivers follow, change lanes and merge; ours are all driven by the paper's law. Both step the
+/// same number of corridors of the same lengths and demand, 0.1 s at a time.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct SumoPoint {
+    /// Mean number of vehicles in SUMO's network.
+    pub vehicles: f64,
+    /// SUMO's mean time of a vehicle-step, ns.
+    pub ns_per_vehicle_step: f64,
+    /// Vehicles in ours.
+    pub our_vehicles: u32,
+    /// Our median step in one process, per vehicle, ns.
+    pub our_ns_per_vehicle_step: f64,
+    /// `ns_per_vehicle_step / our_ns_per_vehicle_step`.
+    pub ratio: f64,
+}
+
 /// The results.
 #[derive(Clone, Debug, Serialize)]
 pub struct ScaleReport {
@@ -40,6 +60,10 @@ pub struct ScaleReport {
     pub points: Vec<ScalePoint>,
     /// Per number of controller processes: exponent p of the fit step time = c * vehicles^p.
     pub growth_exponents: Vec<(u32, f64)>,
+    /// SUMO beside ours, when asked for.
+    pub sumo: Vec<SumoPoint>,
+    /// Its version, when asked for.
+    pub sumo_version: Option<String>,
 }
 
 /// Measures all sizes with everything in one process, one, and two controller processes.
@@ -50,6 +74,7 @@ pub fn scale(
     let machine = Machine::here();
     let mut points = Vec::new();
     let mut growth_exponents = Vec::new();
+    let mut beside = Vec::new();
     for controllers in [0, 1, 2] {
         for &size in &options.sizes {
             let outcome = (options.run)(size, controllers).map_err(BenchError::Run)?;
@@ -69,6 +94,18 @@ pub fn scale(
                 world_bytes: outcome.peak_rss_bytes,
             };
             done(&point);
+            if let (0, Some((sumo, least))) = (controllers, &options.sumo)
+                && size >= *least
+            {
+                let theirs = sumo.measure(size)?;
+                beside.push(SumoPoint {
+                    vehicles: theirs.vehicles,
+                    ns_per_vehicle_step: theirs.ns_per_vehicle_step,
+                    our_vehicles: point.vehicles,
+                    our_ns_per_vehicle_step: point.ns_per_vehicle_step,
+                    ratio: theirs.ns_per_vehicle_step / point.ns_per_vehicle_step,
+                });
+            }
             points.push(point);
         }
         let of_these: Vec<&ScalePoint> = points.iter().filter(|p| p.controllers == controllers).collect();
@@ -76,7 +113,8 @@ pub fn scale(
             growth_exponents.push((controllers, exponent));
         }
     }
-    Ok(ScaleReport { machine, points, growth_exponents })
+    let sumo_version = options.sumo.as_ref().map(|(sumo, _)| sumo.version().to_owned());
+    Ok(ScaleReport { machine, points, growth_exponents, sumo: beside, sumo_version })
 }
 
 /// Least-squares slope of log step time over log vehicles.

@@ -1,5 +1,6 @@
 //! `cz bench solver`: the closed-form QP next to Clarabel, and the whole controller, on a real run.
 
+use super::instructions::Instructions;
 use super::machine::Machine;
 use super::{BenchError, io};
 use crate::control::law::Program;
@@ -32,12 +33,38 @@ pub struct SolverReport {
     pub clarabel_ns: f64,
     /// `clarabel_ns / closed_form_ns`.
     pub ratio: f64,
-    /// Greatest difference of the two answers, m/s^2.
+    /// Clarabel, set up once and given new numbers for each QP, ns per QP. Programs of fewer rows than the
+    /// longest are filled up with rows that are always satisfied.
+    pub clarabel_updated_ns: f64,
+    /// `clarabel_updated_ns / closed_form_ns`.
+    pub ratio_updated: f64,
+    /// Rows of the solver that is updated.
+    pub updated_rows: usize,
+    /// Greatest difference of an answer of Clarabel, either way, to the closed form, m/s^2.
     pub greatest_difference_mps2: f64,
+    /// The same of the fresh solver alone, m/s^2.
+    pub greatest_difference_fresh_mps2: f64,
+    /// The same of the updated solver alone, m/s^2.
+    pub greatest_difference_updated_mps2: f64,
     /// The whole controller (partners, rows, reference, QP, verdict, command), ns per vehicle-step.
     pub controller_ns: f64,
     /// Vehicle-steps of the run.
     pub vehicle_steps: usize,
+    /// Instructions, where they can be counted.
+    pub instructions: Option<InstructionCounts>,
+}
+
+/// Instructions retired in user space, counted by the processor in a pass of their own.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct InstructionCounts {
+    /// Closed form, per QP.
+    pub closed_form: f64,
+    /// Clarabel set up afresh, per QP.
+    pub clarabel: f64,
+    /// Clarabel given new numbers, per QP.
+    pub clarabel_updated: f64,
+    /// The whole controller, per vehicle-step.
+    pub controller: f64,
 }
 
 /// One step of the run as a controller sees it.
@@ -51,6 +78,8 @@ struct Step {
 const CLARABEL_SAMPLE: usize = 20_000;
 /// Passes over the whole run; the fastest counts, as interruptions only ever add.
 const PASSES: usize = 20;
+/// Passes over Clarabel's sample.
+const CLARABEL_PASSES: usize = 3;
 
 /// Measures on the programs and frames of one run.
 pub fn solver(scenario: &Arc<Scenario>) -> Result<SolverReport, BenchError> {
@@ -71,55 +100,72 @@ pub fn solver(scenario: &Arc<Scenario>) -> Result<SolverReport, BenchError> {
         observer.command(step.time_s, &step.states, |_| vehicle_steps += 1).map_err(broken)?;
     }
 
-    let mut closed_form_ns = f64::INFINITY;
-    for _ in 0..PASSES {
-        let start = Instant::now();
+    let closed_form = || {
         for (program, _) in &programs {
             black_box(qp::solve(black_box(&program.tracking), black_box(&program.interval)));
         }
+    };
+    let mut closed_form_ns = f64::INFINITY;
+    for _ in 0..PASSES {
+        let start = Instant::now();
+        closed_form();
         closed_form_ns = closed_form_ns.min(start.elapsed().as_nanos() as f64 / programs.len() as f64);
     }
 
     let stride = programs.len().div_ceil(CLARABEL_SAMPLE).max(1);
     let sample: Vec<_> = programs.iter().step_by(stride).collect();
-    let start = Instant::now();
-    let answers: Vec<Option<f64>> =
-        sample.iter().map(|(program, rows)| clarabel::solve(&program.tracking, rows)).collect();
-    let clarabel_ns = start.elapsed().as_nanos() as f64 / sample.len() as f64;
-    let mut greatest_difference_mps2 = 0.0f64;
-    for ((program, _), answer) in sample.iter().zip(answers) {
-        match (qp::solve(&program.tracking, &program.interval), answer) {
-            (Some(ours), Some(theirs)) => {
-                greatest_difference_mps2 = greatest_difference_mps2.max((ours - theirs).abs());
-            }
-            (None, None) => {}
-            (ours, theirs) => {
-                return Err(BenchError::Disagreement(format!(
-                    "closed form {ours:?}, Clarabel {theirs:?} on {program:?}"
-                )));
-            }
-        }
+    let longest = sample.iter().map(|(_, rows)| rows.len()).max().unwrap_or(0);
+    let mut reused = clarabel::Reused::new(longest);
+    let mut fresh = || sample.iter().map(|(p, rows)| clarabel::solve(&p.tracking, rows)).collect::<Vec<_>>();
+    let mut updated = || sample.iter().map(|(p, rows)| reused.solve(&p.tracking, rows)).collect::<Vec<_>>();
+    let mut clarabel_ns = f64::INFINITY;
+    let mut clarabel_updated_ns = f64::INFINITY;
+    let mut differences = [0.0f64; 2];
+    // In turn, so that a slow spell of the machine meets both.
+    for _ in 0..CLARABEL_PASSES {
+        let timed = |solve: &mut dyn FnMut() -> Vec<Option<f64>>, best: &mut f64| {
+            let start = Instant::now();
+            let answers = solve();
+            *best = best.min(start.elapsed().as_nanos() as f64 / sample.len() as f64);
+            greatest_difference(&sample, &answers)
+        };
+        let fresh = timed(&mut fresh, &mut clarabel_ns)?;
+        let updated = timed(&mut updated, &mut clarabel_updated_ns)?;
+        differences = [differences[0].max(fresh), differences[1].max(updated)];
     }
 
-    // Whole controller: only `command` is timed; what an event brings is coordination's cost.
     let mut controller_ns = f64::INFINITY;
-    let mut sink: Vec<VehicleCommand> = Vec::with_capacity(1024);
     for _ in 0..PASSES {
-        let mut pool = pool();
         let mut spent = 0;
-        for chunk in steps.chunk_by(|_, next| next.assignments.is_empty()) {
-            pool.coordinate(&chunk[0].states, &chunk[0].assignments).map_err(broken)?;
+        control(&steps, pool(), |commands| {
             // One clock reading per stretch between events: reading it costs as much as a vehicle.
             let start = Instant::now();
-            for step in chunk {
-                sink.clear();
-                pool.command(step.time_s, &step.states, |c| sink.push(c)).map_err(broken)?;
-                black_box(&sink);
-            }
+            commands()?;
             spent += start.elapsed().as_nanos();
-        }
+            Ok(())
+        })?;
         controller_ns = controller_ns.min(spent as f64 / vehicle_steps as f64);
     }
+
+    let instructions = Instructions::counter().and_then(|mut counter| {
+        let per = |count: u64, what: usize| count as f64 / what as f64;
+        let mut in_control = 0;
+        let closed_form = per(counter.count(closed_form)?, programs.len());
+        let clarabel = per(counter.count(|| drop(black_box(fresh())))?, sample.len());
+        let clarabel_updated = per(counter.count(|| drop(black_box(updated())))?, sample.len());
+        control(&steps, pool(), |commands| {
+            let mut outcome = Ok(());
+            in_control += counter.count(|| outcome = commands()).unwrap_or(0);
+            outcome
+        })
+        .ok()?;
+        Some(InstructionCounts {
+            closed_form,
+            clarabel,
+            clarabel_updated,
+            controller: per(in_control, vehicle_steps),
+        })
+    });
     let infeasible = programs.iter().filter(|(p, _)| p.interval.is_empty()).count();
     Ok(SolverReport {
         machine,
@@ -129,10 +175,59 @@ pub fn solver(scenario: &Arc<Scenario>) -> Result<SolverReport, BenchError> {
         closed_form_ns,
         clarabel_ns,
         ratio: clarabel_ns / closed_form_ns,
-        greatest_difference_mps2,
+        clarabel_updated_ns,
+        ratio_updated: clarabel_updated_ns / closed_form_ns,
+        updated_rows: longest + 1,
+        greatest_difference_mps2: differences[0].max(differences[1]),
+        greatest_difference_fresh_mps2: differences[0],
+        greatest_difference_updated_mps2: differences[1],
         controller_ns,
         vehicle_steps,
+        instructions,
     })
+}
+
+/// The greatest difference of these answers to the closed form's, m/s^2.
+fn greatest_difference(
+    sample: &[&(Program, Vec<(Inequality, Row)>)],
+    answers: &[Option<f64>],
+) -> Result<f64, BenchError> {
+    let mut greatest = 0.0f64;
+    for ((program, _), answer) in sample.iter().zip(answers) {
+        match (qp::solve(&program.tracking, &program.interval), *answer) {
+            (Some(ours), Some(theirs)) => greatest = greatest.max((ours - theirs).abs()),
+            (None, None) => {}
+            (ours, theirs) => {
+                return Err(BenchError::Disagreement(format!(
+                    "closed form {ours:?}, Clarabel {theirs:?} on {program:?}"
+                )));
+            }
+        }
+    }
+    Ok(greatest)
+}
+
+/// Lets a pool answer all steps. `measure` is handed one stretch between events after the other: only the
+/// commands are to be measured; what an event brings is coordination's cost.
+fn control(
+    steps: &[Step],
+    mut pool: ControllerPool,
+    mut measure: impl FnMut(&mut dyn FnMut() -> Result<(), BenchError>) -> Result<(), BenchError>,
+) -> Result<(), BenchError> {
+    let broken = |e: crate::control::pool::PoolError| BenchError::Disagreement(e.to_string());
+    let mut sink: Vec<VehicleCommand> = Vec::with_capacity(1024);
+    for chunk in steps.chunk_by(|_, next| next.assignments.is_empty()) {
+        pool.coordinate(&chunk[0].states, &chunk[0].assignments).map_err(broken)?;
+        measure(&mut || {
+            for step in chunk {
+                sink.clear();
+                pool.command(step.time_s, &step.states, |c| sink.push(c)).map_err(broken)?;
+                black_box(&sink);
+            }
+            Ok(())
+        })?;
+    }
+    Ok(())
 }
 
 /// Runs the scenario once and keeps what the controller saw.

@@ -401,11 +401,7 @@ fn memory(command: &VehicleCommand) -> Memory {
         start_s: command.plan_start_s,
         origin_m: command.plan_origin_m,
         v0_mps: command.plan_v0_mps,
-        optimum: Optimum {
-            a: command.plan_a,
-            b: command.plan_b,
-            duration_s: command.plan_duration_s,
-        },
+        optimum: Optimum { a: command.plan_a, b: command.plan_b, duration_s: command.plan_duration_s },
         terminal: if command.plan_terminal_mps < 0.0 {
             Terminal::Free
         } else {

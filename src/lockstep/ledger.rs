@@ -193,7 +193,8 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
             return Handover { downstream: downstream.collect(), due, fresh, ..Handover::default() };
         }
         // What was due in the last step has been acted on, and what was fresh is due.
-        let acted_on = self.due.iter().filter(|s| self.downstream_zone[s.to_zone as usize] == Some(s.from_zone));
+        let acted_on =
+            self.due.iter().filter(|s| self.downstream_zone[s.to_zone as usize] == Some(s.from_zone));
         let downstream = downstream.chain(acted_on.copied()).collect();
         Handover { downstream, due: self.fresh.clone(), ..Handover::default() }
     }

@@ -300,13 +300,8 @@ where
         let index = header.sender_index;
         let seat = self.controllers.get_mut(usize::from(index));
         let generation = seat.as_ref().map_or(0, |seat| seat.generation);
-        let expected = ExpectedHeader {
-            run_id: self.identity.run_id,
-            role: Role::Controller,
-            index,
-            generation,
-            step,
-        };
+        let expected =
+            ExpectedHeader { run_id: self.identity.run_id, role: Role::Controller, index, generation, step };
         check_sender(&expected, frame, frame.records().len(), seat, missing, &self.ports.command)?;
         match self.world.command(u32::from(index), frame.records()) {
             Ok(()) => Ok(index),
@@ -348,13 +343,8 @@ where
         let count = self.coordinators.len() as u32;
         let seat = self.coordinators.get_mut(usize::from(index));
         let generation = seat.as_ref().map_or(0, |seat| seat.generation);
-        let expected = ExpectedHeader {
-            run_id: self.identity.run_id,
-            role: Role::Coordinator,
-            index,
-            generation,
-            step,
-        };
+        let expected =
+            ExpectedHeader { run_id: self.identity.run_id, role: Role::Coordinator, index, generation, step };
         let inbox = self.ports.coordination.as_ref().expect("the frame came from this inbox");
         check_sender(&expected, frame, frame.records().len(), seat, missing, inbox)?;
         let own = zones_of(self.world.scenario().network.zones.len() as u32, u32::from(index), count);
@@ -416,11 +406,7 @@ fn check_sender<R: ipc_schemas::Record, F: Frame<R>, I: Inbox<R>>(
 }
 
 /// Checks a state frame as its receivers do; the step is their business.
-pub(super) fn check_state(
-    run_id: u64,
-    header: &FrameHeader,
-    records: usize,
-) -> Result<(), LockstepError> {
+pub(super) fn check_state(run_id: u64, header: &FrameHeader, records: usize) -> Result<(), LockstepError> {
     ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
         .check(header, records)
         .map_err(|fault| LockstepError::Header { sender: sender(header), fault })

@@ -433,9 +433,9 @@ impl Reception {
     pub(super) fn peers(&self) -> Peers {
         let peers = |role, places: &[Place]| {
             let processes: Vec<_> = places.iter().map(|p| p.occupant.map(|o| o.process_id)).collect();
-            (0..).zip(processes).filter_map(move |(index, process_id)| {
-                Some(Peer { role, index, process_id: process_id? })
-            })
+            (0..)
+                .zip(processes)
+                .filter_map(move |(index, process_id)| Some(Peer { role, index, process_id: process_id? }))
         };
         Peers(
             peers(Role::Coordinator, &self.coordinators)

@@ -5,6 +5,7 @@ mod participant;
 mod peers;
 mod placement;
 pub mod plugin_check;
+mod realtime;
 mod run_spec;
 mod stop;
 mod wait;
@@ -14,12 +15,13 @@ pub use attach::{Attachment, Joining};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
 pub use placement::{Affinity, Placement, place, unplaced};
+pub use realtime::{Settled, Settling};
 pub use run_spec::plugin_bytes;
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
-    LatencyUs, Outcome, Percentiles, Replacement, WorldOptions, check_cores, new_histogram, run_in_process,
-    run_in_process_observed, run_world,
+    LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, WorldOptions, check_cores,
+    expected_vehicles, new_histogram, run_in_process, run_in_process_observed, run_world,
 };
 
 use crate::lockstep::{Awaited, LockstepError};

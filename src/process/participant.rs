@@ -1,8 +1,8 @@
 //! The coordinator and controller processes.
 
-use super::world::{controller_ropes, coordinator_rope, expected_vehicles};
 use super::wait::Participant;
-use super::{Attachment, Joining, Patience, Placement, ProcessError, StopFlag, WaitMode, Waiter, place};
+use super::world::{controller_ropes, coordinator_rope, expected_vehicles};
+use super::{Attachment, Joining, Patience, ProcessError, Settling, StopFlag, WaitMode, Waiter};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::lockstep::{
@@ -12,9 +12,7 @@ use crate::lockstep::{
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::transport::iox::{RunName, RunSpace};
 use crate::transport::{Inbox, Outbox};
-use ipc_schemas::{
-    self as frames, Assignment, AttachReply, Role, VehicleCommand, VehicleState, ZoneSummary,
-};
+use ipc_schemas::{self as frames, Assignment, AttachReply, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::time::Duration;
 
 /// How long a coordinator waits for the next event. Events may be far apart in a paced run; a world that
@@ -26,7 +24,7 @@ pub fn run_coordinator(
     run: &RunName,
     joining: Joining,
     peer_timeout: Duration,
-    placement: Placement,
+    settling: &Settling<'_>,
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
     let space = RunSpace::enter(run)?;
@@ -38,7 +36,7 @@ pub fn run_coordinator(
     let own = |prefix: &str| format!("{prefix}{index}");
     let wait = WaitMode::from_code(attachment.reply.waiting);
     let bell = wait.has_bell(Role::Coordinator).then(|| space.bell(&own(frames::BELL_COORDINATOR_PREFIX)));
-    place(placement, Role::Coordinator, index);
+    settling.settle(Role::Coordinator, index, wait, wait.hot_processes(coordinators, controllers));
     let neighbours = (0..coordinators)
         .filter(|n| mask >> n & 1 == 1)
         .map(|n| {
@@ -75,16 +73,16 @@ pub fn run_controller(
     run: &RunName,
     joining: Joining,
     peer_timeout: Duration,
-    placement: Placement,
+    settling: &Settling<'_>,
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
     let space = RunSpace::enter(run)?;
     let attachment = Attachment::join(&space, run, joining, stop)?;
-    let AttachReply { index, controllers, first_step, .. } = attachment.reply;
+    let AttachReply { index, coordinators, controllers, first_step, .. } = attachment.reply;
     let wait = WaitMode::from_code(attachment.reply.waiting);
     let own_bell = || space.bell(&format!("{}{index}", frames::BELL_CONTROLLER_PREFIX));
     let bell = wait.has_bell(Role::Controller).then(own_bell).flatten();
-    place(placement, Role::Controller, index);
+    settling.settle(Role::Controller, index, wait, wait.hot_processes(coordinators, controllers));
     let scenario = &attachment.scenario;
     // Plug-ins come behind the processes of the pool.
     let pool = controllers - scenario.plugins.len() as u32;

@@ -42,8 +42,7 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     if placement == Placement::None {
         return None;
     }
-    let allowed = sched_getaffinity(None).ok()?;
-    let cores: Vec<usize> = (0..CpuSet::MAX_CPU).filter(|&core| allowed.is_set(core)).collect();
+    let cores = cores();
     let core = match (role, &cores[..]) {
         (_, []) => return None,
         (Role::World, [first, ..]) | (_, [first]) => *first,
@@ -53,4 +52,10 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     set.set(core);
     sched_setaffinity(None, &set).ok()?;
     Some(core)
+}
+
+/// The cores the calling thread may use.
+pub(super) fn cores() -> Vec<usize> {
+    let Ok(allowed) = sched_getaffinity(None) else { return Vec::new() };
+    (0..CpuSet::MAX_CPU).filter(|&core| allowed.is_set(core)).collect()
 }

@@ -1,5 +1,6 @@
 //! How a process waits for a frame: busily at first, then asleep, never for ever.
 
+use super::realtime::Breather;
 use super::{Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
 use crate::transport::iox::Bell;
@@ -44,6 +45,13 @@ impl WaitMode {
             WaitMode::Spin => false,
             WaitMode::Block => true,
         }
+    }
+}
+
+impl WaitMode {
+    /// Processes of a run that wait busily: world and controllers, or everybody.
+    pub fn hot_processes(self, coordinators: u32, controllers: u32) -> usize {
+        1 + controllers as usize + if self == WaitMode::Spin { coordinators as usize } else { 0 }
     }
 }
 
@@ -106,6 +114,8 @@ pub struct Waiter {
     since: Option<Instant>,
     waited: Duration,
     peers_checked: Duration,
+    /// There is one when the process would keep others from running.
+    breather: Option<Breather>,
 }
 
 /// How often the clock is read while polling busily: reading it costs about as much as a poll.
@@ -120,8 +130,12 @@ impl Waiter {
     pub fn new(patience: Patience, bell: Option<Bell>, stop: StopFlag, peers: Peers) -> Waiter {
         // Without a bell nobody ends a long sleep.
         let nap = if bell.is_some() { patience.nap } else { patience.nap.min(NAP) };
+        let breather = Breather::if_needed();
+        // Under SCHED_FIFO a yield lets nobody run who does not have it too: sleeping does.
+        let busy = if breather.is_some() { patience.spin } else { patience.busy };
         Waiter {
-            patience: Patience { nap, ..patience },
+            patience: Patience { nap, busy, ..patience },
+            breather,
             bell,
             stop,
             peers,
@@ -134,6 +148,9 @@ impl Waiter {
 
     /// Something came.
     pub fn reset(&mut self) {
+        if let Some(breather) = &mut self.breather {
+            breather.breathe();
+        }
         self.polls = 0;
         self.since = None;
         self.waited = Duration::ZERO;
@@ -163,6 +180,9 @@ impl Waiter {
     fn look(&mut self, awaited: Awaited) -> Result<(), ProcessError> {
         if self.stop.is_set() {
             return Err(ProcessError::Interrupted { step: Some(awaited.step) });
+        }
+        if let Some(breather) = &mut self.breather {
+            breather.breathe();
         }
         self.waited = self.since.get_or_insert_with(Instant::now).elapsed();
         if self.waited >= self.patience.timeout {

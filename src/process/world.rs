@@ -1,14 +1,14 @@
 //! The world process.
 
 use super::attach::{Readiness, Reception};
-use super::{Patience, Peer, Peers, ProcessError, StopFlag, WaitMode, Waiter};
+use super::{Patience, Peer, Peers, ProcessError, Settled, StopFlag, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Awaited, Progress, RefusedFrames, Seat, WorldDriver, WorldPorts};
 use crate::record::StepFrames;
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
-use crate::transport::{Inbox, Outbox};
 use crate::transport::iox::{BellRope, BellService, RunName, RunSpace, Service, ServiceLimits, SpaceError};
+use crate::transport::{Inbox, Outbox};
 use crate::world::{World, WorldSummary};
 use hdrhistogram::Histogram;
 use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
@@ -70,6 +70,9 @@ pub struct Outcome {
     pub refused: Vec<RefusedFrames>,
     /// Answers that came too late or twice.
     pub late_frames: u64,
+    /// Where each process was and what it was granted; filled in by who started them.
+    #[serde(default)]
+    pub placement: Vec<Settled>,
 }
 
 /// A process that took the place of one that had died.
@@ -127,11 +130,18 @@ impl Percentiles {
 
 /// An empty latency histogram of three significant digits that grows as needed.
 pub fn new_histogram() -> Histogram<u64> {
-    Histogram::new(3).expect("three significant digits are valid")
+    let mut histogram = Histogram::new_with_bounds(1, AT_FIRST_NS, 3).expect("the bounds are valid");
+    histogram.auto(true);
+    // Writes to all of it, so that no page of it is missing when time is measured.
+    histogram.clear();
+    histogram
 }
 
+/// What a histogram has room for from the beginning, ns: a second.
+const AT_FIRST_NS: u64 = 1_000_000_000;
+
 /// Steps before the steady and event latencies are recorded: memory is mapped and caches fill.
-const WARM_UP_STEPS: u64 = 500;
+pub const WARM_UP_STEPS: u64 = 500;
 
 /// Steps between two looks at the signal flag and the clock for progress.
 const STEPS_PER_LOOK: u64 = 64;
@@ -188,6 +198,7 @@ impl StepMeter {
             replacements: history.replacements,
             refused: history.refused,
             late_frames: history.late_frames,
+            placement: Vec::new(),
         }
     }
 }
@@ -325,7 +336,8 @@ impl House {
                 Ok(())
             }
             (Err(ProcessError::Timeout { awaited, seconds }), Some(peer)) => {
-                let consequence = format!("nobody took its place within {seconds} s of waiting for {awaited}");
+                let consequence =
+                    format!("nobody took its place within {seconds} s of waiting for {awaited}");
                 Err(ProcessError::PeerGone { peer, consequence })
             }
             (result, _) => result,
@@ -571,7 +583,7 @@ pub(super) fn coordinator_rope(space: &RunSpace, wait: WaitMode, index: u32) -> 
 
 /// About as many vehicles as the network holds in dense but moving traffic. Frames may be longer; this
 /// only decides how much memory is laid out at first.
-pub(super) fn expected_vehicles(scenario: &Scenario) -> usize {
+pub fn expected_vehicles(scenario: &Scenario) -> usize {
     const DENSE_SPACING_M: f64 = 12.0;
     let lengths = scenario.network.zones.iter().flat_map(|z| z.approaches.iter().map(|a| a.length_m));
     lengths.map(|l| (l / DENSE_SPACING_M).ceil() as usize + 2).sum()
