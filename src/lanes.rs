@@ -47,11 +47,6 @@ impl<T: Copy> Lanes<T> {
         self.total
     }
 
-    /// All lanes in order.
-    pub fn iter(&self) -> impl Iterator<Item = &[T]> {
-        self.lanes.iter().map(|lane| &self.items[lane.range()])
-    }
-
     /// Appends an item to a lane.
     pub fn push(&mut self, lane: usize, item: T) {
         let Lane { len, capacity, .. } = self.lanes[lane];
@@ -168,7 +163,6 @@ mod tests {
                 }
                 prop_assert_eq!(lanes.total(), vectors.iter().map(Vec::len).sum::<usize>());
             }
-            prop_assert!(lanes.iter().eq(vectors.iter().map(Vec::as_slice)));
             for (i, vector) in vectors.iter().enumerate() {
                 prop_assert_eq!(&lanes[i], &vector[..]);
             }
