@@ -6,6 +6,7 @@ pub mod bench;
 pub mod control;
 pub mod coordination;
 pub mod encoding;
+mod lanes;
 pub mod lockstep;
 pub mod process;
 pub mod record;

@@ -11,7 +11,7 @@ use crate::scenario::Scenario;
 use crate::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
 use crate::transport::{Inbox, Outbox};
 use crate::world::World;
-use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::Instant;

@@ -3,6 +3,7 @@
 use super::law::{Law, Memory, Mode, Partner, PartnerKind, Program, Situation, Verdict};
 use super::reference::{Optimum, Reference, Terminal};
 use super::rows::Row;
+use crate::lanes::Lanes;
 use crate::scenario::{Scenario, ZoneId};
 use crate::vehicle::Inequality;
 use ipc_schemas::{self as frames, Assignment, VehicleCommand, VehicleState};
@@ -12,21 +13,27 @@ use std::sync::Arc;
 /// Drives the vehicles of a contiguous range of zones with the built-in law.
 #[derive(Debug)]
 pub struct ControllerPool {
-    scenario: Arc<Scenario>,
     law: Law,
     zones: Range<ZoneId>,
-    crews: Vec<Crew>,
+    /// Lengths of each zone's approaches, m.
+    lengths_m: Lanes<f64>,
+    /// The vehicles of each zone, aligned with its members in the state frame.
+    members: Lanes<Member>,
+    /// Their constraints.
+    constraints: Lanes<Constraint>,
+    /// Where each zone's slice began in the last frame: about where it begins in the next.
+    starts: Vec<usize>,
+    /// A zone's new members and constraints while they are put together; kept for their allocations.
+    crew: Crew,
     /// Approaches of these zones that plug-ins drive.
     plugged: Vec<(ZoneId, u32)>,
 }
 
-/// The vehicles of one zone, aligned with the zone's members in the state frame.
+/// The vehicles of one zone and what binds them.
 #[derive(Debug, Default)]
 struct Crew {
     members: Vec<Member>,
     constraints: Vec<Constraint>,
-    /// The previous crew while a new one is built; kept for its allocation.
-    retired: Vec<Member>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -34,7 +41,7 @@ struct Member {
     vehicle: u32,
     terminal: Terminal,
     memory: Memory,
-    /// Range in [`Crew::constraints`].
+    /// Range in the zone's constraints.
     first_constraint: u32,
     end_constraint: u32,
 }
@@ -108,10 +115,23 @@ pub enum PoolError {
 impl ControllerPool {
     /// A pool for the given zones.
     pub fn new(scenario: Arc<Scenario>, zones: Range<ZoneId>) -> ControllerPool {
-        let crews = zones.clone().map(|_| Crew::default()).collect();
+        let count = zones.len();
+        let mut lengths_m = Lanes::new(count);
+        for (lane, zone) in zones.clone().enumerate() {
+            let approaches = &scenario.network.zones[zone as usize].approaches;
+            approaches.iter().for_each(|a| lengths_m.push(lane, a.length_m));
+        }
         let plugged = scenario.plugins.iter().flat_map(|p| p.approaches.iter().copied());
-        let plugged = plugged.filter(|(zone, _)| zones.contains(zone)).collect();
-        ControllerPool { law: Law::new(&scenario), scenario, zones, crews, plugged }
+        ControllerPool {
+            law: Law::new(&scenario),
+            lengths_m,
+            members: Lanes::new(count),
+            constraints: Lanes::new(count),
+            starts: vec![0; count],
+            crew: Crew::default(),
+            plugged: plugged.filter(|(zone, _)| zones.contains(zone)).collect(),
+            zones,
+        }
     }
 
     /// The number of commands a state frame asks of this pool.
@@ -126,11 +146,20 @@ impl ControllerPool {
         states: &[VehicleState],
         assignments: &[Assignment],
     ) -> Result<(), PoolError> {
+        // How far zones begin from where they did in the last frame, as seen at the zone before.
+        let mut drift = 0;
         for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
             let zone = group[0].zone;
             if self.zones.contains(&zone) {
-                let slice = zone_slice(states, zone);
-                self.crews[(zone - self.zones.start) as usize].assign(zone, slice, group)?;
+                let lane = (zone - self.zones.start) as usize;
+                let expected = self.starts[lane].wrapping_add(drift);
+                let from = first_of(states, zone, expected);
+                drift = from.wrapping_sub(self.starts[lane]);
+                let slice = states[from..].chunk_by(|a, b| a.zone == b.zone).next().unwrap_or(&[]);
+                let slice = if slice.first().is_some_and(|s| s.zone == zone) { slice } else { &[] };
+                self.crew.assign(zone, slice, group, &self.members[lane])?;
+                self.members.set(lane, &self.crew.members);
+                self.constraints.set(lane, &self.crew.constraints);
             }
         }
         Ok(())
@@ -148,21 +177,22 @@ impl ControllerPool {
         commands: &[VehicleCommand],
         in_force: &[Assignment],
     ) -> Result<(), PoolError> {
-        self.crews.iter_mut().for_each(|crew| *crew = Crew::default());
+        for lane in 0..self.zones.len() {
+            self.members.set(lane, &[]);
+            self.constraints.set(lane, &[]);
+        }
         for group in commands.chunk_by(|a, b| a.zone == b.zone) {
             if self.zones.contains(&group[0].zone) {
-                let crew = &mut self.crews[(group[0].zone - self.zones.start) as usize];
-                crew.members.extend(group.iter().map(Member::remembered));
+                let remembered: Vec<Member> = group.iter().map(Member::remembered).collect();
+                self.members.set((group[0].zone - self.zones.start) as usize, &remembered);
             }
         }
         for group in in_force.chunk_by(|a, b| a.zone == b.zone) {
-            let zone = group[0].zone;
-            if self.zones.contains(&zone) {
-                let slice = zone_slice(states, zone);
-                let members = slice.iter().filter(|s| s.flags & frames::STATE_LEFT == 0).map(|s| s.vehicle);
-                if members.eq(group.chunk_by(|a, b| a.vehicle == b.vehicle).map(|g| g[0].vehicle)) {
-                    self.crews[(zone - self.zones.start) as usize].assign(zone, slice, group)?;
-                }
+            let from = states.partition_point(|s| s.zone < group[0].zone);
+            let slice = states[from..].iter().take_while(|s| s.zone == group[0].zone);
+            let members = slice.filter(|s| s.flags & frames::STATE_LEFT == 0).map(|s| s.vehicle);
+            if members.eq(group.chunk_by(|a, b| a.vehicle == b.vehicle).map(|g| g[0].vehicle)) {
+                self.coordinate(states, group)?;
             }
         }
         Ok(())
@@ -204,20 +234,23 @@ impl ControllerPool {
         mut with: impl FnMut(&Law, &VehicleState, &Situation, Partners<'_>, &mut Memory),
     ) -> Result<(), PoolError> {
         let range = self.own_range(states);
+        let mut start = range.start;
         for slice in states[range].chunk_by(|a, b| a.zone == b.zone) {
             let zone = slice[0].zone;
-            let approaches = &self.scenario.network.zones[zone as usize].approaches;
-            let crew = &mut self.crews[(zone - self.zones.start) as usize];
-            let members = &slice[usize::from(slice[0].flags & frames::STATE_LEFT != 0)..];
-            if members.is_empty() {
+            let lane = (zone - self.zones.start) as usize;
+            self.starts[lane] = start;
+            start += slice.len();
+            let present = &slice[usize::from(slice[0].flags & frames::STATE_LEFT != 0)..];
+            if present.is_empty() {
                 continue;
             }
-            let unassigned =
-                PoolError::Unassigned { zone, present: members.len(), assigned: crew.members.len() };
-            if members.len() != crew.members.len() {
+            let members = &mut self.members[lane];
+            let unassigned = PoolError::Unassigned { zone, present: present.len(), assigned: members.len() };
+            if present.len() != members.len() {
                 return Err(unassigned);
             }
-            for (state, member) in members.iter().zip(&mut crew.members) {
+            let (lengths_m, constraints) = (&self.lengths_m[lane], &self.constraints[lane]);
+            for (state, member) in present.iter().zip(members) {
                 if state.vehicle != member.vehicle {
                     return Err(unassigned);
                 }
@@ -230,12 +263,11 @@ impl ControllerPool {
                     v_mps: state.v_mps,
                     entry_time_s: state.entry_time_s,
                     entry_speed_mps: state.entry_speed_mps,
-                    length_m: approaches[state.path as usize].length_m,
+                    length_m: lengths_m[state.path as usize],
                     terminal: member.terminal,
                 };
-                let constraints =
-                    &crew.constraints[member.first_constraint as usize..member.end_constraint as usize];
-                let partners = Partners { constraints: constraints.iter(), slice };
+                let own = &constraints[member.first_constraint as usize..member.end_constraint as usize];
+                let partners = Partners { constraints: own.iter(), slice };
                 with(&self.law, state, &situation, partners, &mut member.memory);
             }
         }
@@ -270,25 +302,28 @@ impl Member {
     }
 }
 
-/// A zone's S(t) in a state frame.
-fn zone_slice(states: &[VehicleState], zone: ZoneId) -> &[VehicleState] {
-    let from = states.partition_point(|s| s.zone < zone);
-    &states[from..from + states[from..].partition_point(|s| s.zone == zone)]
+/// The place of a zone's first record, or where it would be. Zones move little from frame to frame, so the
+/// place expected is tried before all are searched.
+fn first_of(states: &[VehicleState], zone: ZoneId, expected: usize) -> usize {
+    let begins_at = |i: usize| {
+        states.get(i).is_some_and(|s| s.zone == zone) && (i == 0 || states[i - 1].zone < zone)
+    };
+    if begins_at(expected) { expected } else { states.partition_point(|s| s.zone < zone) }
 }
 
 impl Crew {
-    /// Rebuilds the crew from the zone's slice and its assignments; memories are kept by vehicle.
+    /// Puts a zone's crew together from its slice and its assignments; memories are kept by vehicle.
     fn assign(
         &mut self,
         zone: ZoneId,
         slice: &[VehicleState],
         assignments: &[Assignment],
+        before: &[Member],
     ) -> Result<(), PoolError> {
-        std::mem::swap(&mut self.members, &mut self.retired);
         self.members.clear();
         self.constraints.clear();
         let mut groups = assignments.chunk_by(|a, b| a.vehicle == b.vehicle);
-        let mut known = self.retired.iter().peekable();
+        let mut known = before.iter().peekable();
         for state in slice.iter().filter(|s| s.flags & frames::STATE_LEFT == 0) {
             let group = groups.next().unwrap_or(&[]);
             if group.first().is_none_or(|a| a.vehicle != state.vehicle) {
@@ -299,7 +334,7 @@ impl Crew {
             let memory = loop {
                 match known.peek() {
                     Some(old) if old.vehicle == state.vehicle => break old.memory,
-                    Some(_) if self.retired.iter().any(|m| m.vehicle == state.vehicle) => known.next(),
+                    Some(_) if before.iter().any(|m| m.vehicle == state.vehicle) => known.next(),
                     _ => break Memory::ENTERED,
                 };
             };

@@ -2,6 +2,7 @@
 
 use super::{Scenario, ZoneId};
 use serde::{Deserialize, Serialize};
+use std::ops::Range;
 
 /// A controller written elsewhere, which joins the run as a process of its own.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -54,6 +55,10 @@ pub struct Drivers {
     plugins: u32,
     /// Controller index by zone and path.
     of: Vec<Vec<u32>>,
+    /// By zone, the controller of all its approaches, if it is one.
+    of_zone: Vec<Option<u32>>,
+    /// By controller, the zones outside which it drives nothing.
+    zones: Vec<Range<ZoneId>>,
 }
 
 impl Drivers {
@@ -64,25 +69,40 @@ impl Drivers {
     pub fn new(scenario: &Scenario, controllers: u32) -> Drivers {
         let plugins = scenario.plugins.len() as u32;
         let pool = controllers.checked_sub(plugins).expect("every plug-in is a controller process");
-        let zones = scenario.network.zones.len() as u32;
+        let count = scenario.network.zones.len() as u32;
         let mut of: Vec<Vec<u32>> =
             scenario.network.zones.iter().map(|z| vec![u32::MAX; z.approaches.len()]).collect();
-        for index in 0..pool {
-            for zone in super::share::zones_of(zones, index, pool) {
-                of[zone as usize].fill(index);
-            }
+        let mut zones: Vec<Range<ZoneId>> =
+            (0..pool).map(|index| super::share::zones_of(count, index, pool)).collect();
+        for (index, range) in (0..).zip(&zones) {
+            range.clone().for_each(|zone| of[zone as usize].fill(index));
         }
         for (plugin, index) in scenario.plugins.iter().zip(pool..) {
             for &(zone, path) in &plugin.approaches {
                 of[zone as usize][path as usize] = index;
             }
+            let first = plugin.approaches.iter().map(|&(zone, _)| zone).min();
+            let last = plugin.approaches.iter().map(|&(zone, _)| zone).max();
+            zones.push(first.zip(last).map_or(0..0, |(first, last)| first..last + 1));
         }
-        Drivers { pool, plugins, of }
+        let of_zone =
+            of.iter().map(|of| of.iter().all(|&o| o == of[0]).then(|| of[0])).collect();
+        Drivers { pool, plugins, of, of_zone, zones }
     }
 
     /// The controller that drives an approach.
     pub fn of(&self, zone: ZoneId, path: u32) -> u32 {
         self.of[zone as usize][path as usize]
+    }
+
+    /// The controller that drives all approaches of a zone, if it is one.
+    pub fn of_zone(&self, zone: ZoneId) -> Option<u32> {
+        self.of_zone[zone as usize]
+    }
+
+    /// Zones outside which a controller drives nothing.
+    pub fn zones(&self, controller: u32) -> Range<ZoneId> {
+        self.zones[controller as usize].clone()
     }
 
     /// Number of processes of the built-in pool.

@@ -1,6 +1,7 @@
 //! A vehicle as the world keeps it while it is in a zone or on a link.
 
 use crate::vehicle::Held;
+use ipc_schemas::NO_VEHICLE;
 
 /// One vehicle in one place.
 #[derive(Clone, Copy, Debug)]
@@ -13,18 +14,15 @@ pub(super) struct Car {
     pub v_mps: f64,
     /// Acceleration an observer saw over the step just ended, m/s^2.
     pub u_mps2: f64,
-    /// Acceleration commanded for the coming step, once shielded, m/s^2.
+    /// Acceleration held over the coming step, m/s^2: commanded, once shielded; of a vehicle that has left
+    /// the zone, what it does elsewhere.
     pub command_mps2: f64,
-    /// Motion over the coming step, set by the vehicle's command (on a link: by its driver).
-    pub held: Held,
     pub entry_time_s: f64,
     pub entry_speed_mps: f64,
     /// Broadcast intent from the last command.
     pub planned_exit_time_s: f64,
     pub planned_exit_speed_mps: f64,
     pub visit: Visit,
-    /// Entered during the step just ended.
-    pub entered: bool,
 }
 
 /// What is accounted while a vehicle is in a zone.
@@ -32,33 +30,41 @@ pub(super) struct Car {
 pub(super) struct Visit {
     pub energy: f64,
     pub fe_s: f64,
-    pub infeasible: bool,
-    /// Whether all rear-end (merging) entry conditions held at the first sample in the zone.
-    pub clean_rear_end: bool,
-    pub clean_merge: bool,
     pub least_rear_end_m: f64,
     /// What the shield holds the vehicle to.
     pub rear_end: Guard,
     pub merge: Guard,
+    /// Entered during the step just ended.
+    pub entered: bool,
+    pub infeasible: bool,
+    /// Whether all rear-end (merging) entry conditions held at the first sample in the zone.
+    pub clean_rear_end: bool,
+    pub clean_merge: bool,
 }
 
 /// Whether a vehicle was safe toward a partner when it came to owe it something.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 pub(super) struct Guard {
-    pub partner: Option<u32>,
+    /// `NO_VEHICLE` before the first.
+    pub partner: u32,
     pub safe: bool,
+}
+
+impl Guard {
+    const NONE: Guard = Guard { partner: NO_VEHICLE, safe: false };
 }
 
 impl Visit {
     pub(super) const NEW: Visit = Visit {
         energy: 0.0,
         fe_s: 0.0,
+        least_rear_end_m: f64::INFINITY,
+        rear_end: Guard::NONE,
+        merge: Guard::NONE,
+        entered: true,
         infeasible: false,
         clean_rear_end: true,
         clean_merge: true,
-        least_rear_end_m: f64::INFINITY,
-        rear_end: Guard { partner: None, safe: false },
-        merge: Guard { partner: None, safe: false },
     };
 }
 
@@ -73,21 +79,23 @@ impl Car {
             v_mps: entry_speed_mps,
             u_mps2: 0.0,
             command_mps2: 0.0,
-            held: Held::new(0.0, entry_speed_mps, 0.0),
             entry_time_s,
             entry_speed_mps,
             planned_exit_time_s: 0.0,
             planned_exit_speed_mps: 0.0,
             visit: Visit::NEW,
-            entered: true,
         }
     }
-}
 
-/// The vehicle that left a zone last (paper: index 0), in the zone's coordinate.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct LeftCar {
-    pub car: Car,
-    /// Left during the step just ended.
-    pub left_now: bool,
+    /// Motion over the coming step.
+    pub(super) fn held(&self) -> Held {
+        Held::new(self.x_m, self.v_mps, self.command_mps2)
+    }
+
+    /// Moves the vehicle to the end of the step.
+    pub(super) fn move_on(&mut self, held: &Held, dt_s: f64) {
+        self.x_m = held.position_m(dt_s);
+        self.v_mps = held.speed_mps(dt_s);
+        self.u_mps2 = held.observed_mps2(dt_s);
+    }
 }

@@ -1,7 +1,7 @@
 //! Entry roads: who arrives when, and who has to wait outside.
 
 use crate::scenario::arrivals::ArrivalStream;
-use crate::scenario::{Arrival, Scenario};
+use crate::scenario::{Arrival, Road, Scenario};
 use crate::vehicle::Held;
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
@@ -14,8 +14,18 @@ pub(super) struct Gates {
     /// Roads by their next arrival: instant (as ordered bits), then road order.
     next: BinaryHeap<Reverse<(u64, usize)>>,
     pub waiting: Vec<VecDeque<Waiting>>,
+    /// Where somebody waits, by zone.
+    pub queues: Vec<Queue>,
     left_to_generate: u32,
     pub held: u32,
+}
+
+/// A road on which somebody waits to enter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct Queue {
+    pub zone: u32,
+    pub road: u32,
+    pub path: u32,
 }
 
 /// An arrival that has not entered yet.
@@ -38,6 +48,7 @@ impl Gates {
             pending: vec![None; roads.len()],
             next: BinaryHeap::with_capacity(roads.len()),
             waiting: vec![VecDeque::new(); roads.len()],
+            queues: Vec::new(),
             left_to_generate: scenario.max_vehicles.unwrap_or(u32::MAX),
             held: 0,
         };
@@ -56,7 +67,15 @@ impl Gates {
     }
 
     /// Moves all arrivals up to `until_s` to their road's queue, in order of instant, then road.
-    pub(super) fn advance(&mut self, until_s: f64) {
+    pub(super) fn advance(&mut self, roads: &[Road], until_s: f64) {
+        let before = self.queues.len();
+        self.collect(roads, until_s);
+        if self.queues.len() > before {
+            self.queues.sort_unstable();
+        }
+    }
+
+    fn collect(&mut self, roads: &[Road], until_s: f64) {
         while self.left_to_generate > 0 {
             let Some(&Reverse((bits, road))) = self.next.peek() else { return };
             if f64::from_bits(bits) > until_s {
@@ -64,6 +83,10 @@ impl Gates {
             }
             self.next.pop();
             let arrival = self.pending[road].take().expect("a queued road has a pending arrival");
+            if self.waiting[road].is_empty() {
+                let Road { zone, path, .. } = roads[road];
+                self.queues.push(Queue { zone, road: road as u32, path });
+            }
             self.waiting[road].push_back(Waiting { arrival, held: false });
             self.left_to_generate -= 1;
             self.draw(road);
@@ -72,7 +95,7 @@ impl Gates {
 
     /// Whether nobody will come any more and nobody waits.
     pub(super) fn exhausted(&self) -> bool {
-        (self.left_to_generate == 0 || self.next.is_empty()) && self.waiting.iter().all(VecDeque::is_empty)
+        (self.left_to_generate == 0 || self.next.is_empty()) && self.queues.is_empty()
     }
 }
 

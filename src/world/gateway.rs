@@ -6,6 +6,7 @@
 //! that depend on it, and the result does not depend on the order in which frames came.
 
 use super::car::{Car, Guard};
+use super::link::LinkCar;
 use super::metrics::{ShieldRow, ShieldSummary};
 use super::role::World;
 use crate::scenario::{Drivers, Exit, Scenario, ShieldMode};
@@ -160,8 +161,17 @@ impl World {
         let Gateway { mode, drivers, rows, .. } = &mut self.gateway;
         let mut next = 0;
         let mut fault = None;
-        'zones: for (zone, traffic) in (0..).zip(&mut self.zones) {
-            for car in traffic.cars.iter_mut().filter(|c| drivers.of(zone, c.path) == sender) {
+        'zones: for zone in drivers.zones(sender) {
+            // Drivers are asked about each vehicle only where there are several.
+            let shared = match drivers.of_zone(zone) {
+                Some(driver) if driver != sender => continue,
+                driver => driver.is_none(),
+            };
+            let first = self.sites[zone as usize].first();
+            for car in &mut self.cars[zone as usize][first..] {
+                if shared && drivers.of(zone, car.path) != sender {
+                    continue;
+                }
                 let record = next;
                 let Some(command) = commands.get(record).filter(|c| c.vehicle == car.vehicle) else {
                     fault = Some((record, car.vehicle, zone));
@@ -203,8 +213,6 @@ impl World {
                     }
                 }
                 car.command_mps2 = u;
-                car.held = Held::new(car.x_m, car.v_mps, u);
-                self.held_u_mps2[vehicle as usize] = u;
                 car.planned_exit_time_s = command.planned_exit_time_s;
                 car.planned_exit_speed_mps = command.planned_exit_speed_mps;
                 if command.verdict == frames::VERDICT_FE {
@@ -249,9 +257,9 @@ impl World {
             return CommandFault::Duplicate { record, vehicle };
         }
         let mut driver = None;
-        for (zone, traffic) in (0..).zip(&self.zones) {
-            if let Some(car) = traffic.cars.iter().find(|c| c.vehicle == vehicle) {
-                driver = Some(self.gateway.drivers.of(zone, car.path));
+        for zone in 0..self.sites.len() {
+            if let Some(car) = self.members(zone).iter().find(|c| c.vehicle == vehicle) {
+                driver = Some(self.gateway.drivers.of(zone as u32, car.path));
             }
         }
         match (driver, expected) {
@@ -265,61 +273,80 @@ impl World {
     /// Settles what every vehicle holds over the step: zones downstream first, and within a zone in passing
     /// order, so that whoever a vehicle depends on has been settled before.
     pub(super) fn hold_all(&mut self, scenario: &Scenario, dt_s: f64) {
-        for zone in (0..self.zones.len()).rev() {
-            self.drive_link(scenario, zone, dt_s);
-            // Index 0 moves with the vehicle it stands for.
-            if let Some(left) = &mut self.zones[zone].left {
-                let mut u = self.held_u_mps2[left.car.vehicle as usize];
-                // Out of the network nobody drives it. Whoever left it creeping must not creep for ever:
-                // those behind would have to leave more slowly each, down to a standstill.
-                if scenario.network.zones[zone].exit == Exit::Out && left.car.v_mps < LEAST_EXIT_MPS {
-                    u = EXIT_MPS2.min(scenario.vehicle.u_max_mps2);
-                }
-                left.car.held = Held::new(left.car.x_m, left.car.v_mps, u);
+        for zone in (0..self.sites.len()).rev() {
+            if self.on_links > 0 {
+                self.drive_link(scenario, zone, dt_s);
+            }
+            if self.sites[zone].has_left {
+                self.hold_left(scenario, zone);
             }
             if self.gateway.mode != ShieldMode::Off {
-                self.shield_zone(scenario, zone);
-                for car in &self.zones[zone].cars {
-                    self.held_u_mps2[car.vehicle as usize] = car.command_mps2;
-                }
+                self.shield_zone(zone);
             }
         }
     }
 
+    /// Index 0 moves with the vehicle it stands for.
+    fn hold_left(&mut self, scenario: &Scenario, zone: usize) {
+        let Car { vehicle, v_mps, .. } = self.cars[zone][0];
+        let mut u = self.followed_mps2(zone, vehicle);
+        // Out of the network nobody drives it. Whoever left it creeping must not creep for ever: those behind
+        // would have to leave more slowly each, down to a standstill.
+        if self.sites[zone].exit == Exit::Out && v_mps < LEAST_EXIT_MPS {
+            u = EXIT_MPS2.min(scenario.vehicle.u_max_mps2);
+        }
+        self.cars[zone][0].command_mps2 = u;
+    }
+
+    /// What the vehicle that left a zone last holds over the step, wherever it is now; 0 once it has left
+    /// the network.
+    fn followed_mps2(&mut self, zone: usize, vehicle: u32) -> f64 {
+        loop {
+            let from = self.sites[zone].left_from as usize;
+            if self.on_links > 0
+                && let Some(on_link) = self.links[from].cars.iter().find(|c| c.car.vehicle == vehicle)
+            {
+                return on_link.held.u_mps2;
+            }
+            let Exit::Zone { zone: next, .. } = self.sites[from].exit else { return 0.0 };
+            if let Some(car) = self.members(next as usize).iter().rev().find(|c| c.vehicle == vehicle) {
+                return car.command_mps2;
+            }
+            self.sites[zone].left_from = next;
+        }
+    }
+
     /// Projects the commands of a zone's members, in passing order.
-    fn shield_zone(&mut self, scenario: &Scenario, index: usize) {
-        let zone = &scenario.network.zones[index];
-        let length_m = |car: &Car| zone.approaches[car.path as usize].length_m;
+    fn shield_zone(&mut self, zone: usize) {
+        let lengths_m = &self.lengths_m[zone];
         let Gateway { mode, shield, drivers, rows, partners } = &mut self.gateway;
-        let traffic = &mut self.zones[index];
-        let left = traffic.left.as_ref().map(|l| &l.car);
-        for i in 0..traffic.cars.len() {
-            let (before, rest) = traffic.cars.split_at_mut(i);
+        let cars = &mut self.cars[zone];
+        for i in self.sites[zone].first()..cars.len() {
+            let (before, rest) = cars.split_at_mut(i);
             let car = &mut rest[0];
             // The partners of `coordination::partners`, from the same order.
-            let ahead =
-                before.iter().rev().find(|c| c.path == car.path).or(left.filter(|c| c.path == car.path));
-            let previous = before.last().or(left).filter(|c| c.path != car.path);
-            let own_length_m = length_m(car);
+            let ahead = before.iter().rev().find(|c| c.path == car.path);
+            let previous = before.last().filter(|c| c.path != car.path);
+            let own_length_m = lengths_m[car.path as usize];
             let merge = Duty::Merge { conflict_m: own_length_m };
             partners.clear();
             for (duty, other) in [(Duty::RearEnd, ahead), (merge, previous)] {
                 let Some(other) = other else { continue };
-                let shift_m = own_length_m - length_m(other);
-                let Held { x0_m, v0_mps, u_mps2, .. } = other.held;
-                let partner = Partner { duty, motion: Held::new(x0_m + shift_m, v0_mps, u_mps2) };
+                let shift_m = own_length_m - lengths_m[other.path as usize];
+                let motion = Held::new(other.x_m + shift_m, other.v_mps, other.command_mps2);
+                let partner = Partner { duty, motion };
                 let guard =
                     if duty == Duty::RearEnd { &mut car.visit.rear_end } else { &mut car.visit.merge };
-                let row = &mut rows[drivers.of(index as u32, car.path) as usize];
+                let row = &mut rows[drivers.of(zone as u32, car.path) as usize];
                 // Judged when the vehicle comes to owe this partner something, and held to it from then on.
-                if guard.partner != Some(other.vehicle) {
+                if guard.partner != other.vehicle {
                     let safe = shield.state_slack_m(car.x_m, car.v_mps, &partner) >= RESERVE_M;
-                    *guard = Guard { partner: Some(other.vehicle), safe };
+                    *guard = Guard { partner: other.vehicle, safe };
                     row.began_unsafe += u32::from(!safe);
                 }
                 partners.push(partner);
             }
-            let row = &mut rows[drivers.of(index as u32, car.path) as usize];
+            let row = &mut rows[drivers.of(zone as u32, car.path) as usize];
             row.commands += 1;
             let found = shield.project(car.x_m, car.v_mps, car.command_mps2, partners.iter().copied());
             match found.row {
@@ -331,8 +358,7 @@ impl World {
             if *mode == ShieldMode::On {
                 car.command_mps2 = found.u_mps2;
             }
-            let held = Held::new(car.x_m, car.v_mps, car.command_mps2);
-            car.held = held;
+            let held = car.held();
             for partner in partners.iter() {
                 let (guard, least) = if partner.duty == Duty::RearEnd {
                     (car.visit.rear_end, &mut row.min_rear_end_margin_m)
@@ -357,18 +383,17 @@ impl World {
             return;
         }
         let Exit::Zone { zone: down, path, link_m } = scenario.network.zones[zone].exit else { return };
-        let last = self.zones[down as usize].cars.iter().rev().find(|c| c.path == path);
-        let mut leader = last.map(|c| Held::new(c.held.x0_m + link_m, c.held.v0_mps, c.held.u_mps2));
-        for car in &mut self.links[zone].cars {
+        let last = self.members(down as usize).iter().rev().find(|c| c.path == path);
+        let mut leader = last.map(|c| Held::new(c.x_m + link_m, c.v_mps, c.command_mps2));
+        for LinkCar { car, held } in &mut self.links[zone].cars {
             let k = scenario.control.k_rear_end_per_s;
             let mut u = super::link::drive(car, leader.as_ref(), &scenario.vehicle, k, dt_s);
             if self.gateway.mode == ShieldMode::On {
                 let partner = leader.map(|motion| Partner { duty: Duty::RearEnd, motion });
                 u = self.gateway.shield.project(car.x_m, car.v_mps, u, partner.into_iter()).u_mps2;
             }
-            car.held = Held::new(car.x_m, car.v_mps, u);
-            self.held_u_mps2[car.vehicle as usize] = u;
-            leader = Some(car.held);
+            *held = Held::new(car.x_m, car.v_mps, u);
+            leader = Some(*held);
         }
     }
 }

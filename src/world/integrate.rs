@@ -1,18 +1,25 @@
 //! One step of the world: exact motion, exact crossing instants, cost and margin accounting.
 
-use super::car::{Car, LeftCar, Visit};
-use super::gate::may_enter;
-use super::link::Link;
-use super::metrics::{CompletedVisit, ZoneMetrics};
-use super::role::{Traffic, World};
-use crate::scenario::{Exit, Scenario, Zone};
+use super::car::{Car, Visit};
+use super::gate::{Queue, may_enter};
+use super::link::{Link, LinkCar};
+use super::metrics::CompletedVisit;
+use super::role::World;
+use crate::scenario::{Exit, Scenario, ZoneId};
 use crate::vehicle::{Held, Merge, Pair, RearEnd, satisfiable_at};
 
 /// A vehicle about to enter a zone at the end of the step.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Entry {
-    zone: u32,
+    zone: ZoneId,
     car: Car,
+}
+
+/// The vehicle a newcomer on a road has ahead of it, if there is one, as it moves over the step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Leader {
+    road: u32,
+    motion: Option<Held>,
 }
 
 impl World {
@@ -22,54 +29,103 @@ impl World {
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
         self.hold_all(&scenario, dt_s);
-        self.entries.clear();
+        self.scratch.entries.clear();
+        self.scratch.leaders.clear();
+        self.events.clear();
+        self.gates.advance(&scenario.network.roads, scenario.time_s(self.step + 1));
+        let mut queue = 0;
         // All that concerns a zone at one go, while its vehicles are in the cache. Motions start from the
         // step's beginning, so it does not matter which zone has moved on already.
-        for zone in 0..self.zones.len() {
-            account_margins(&scenario, zone, &mut self.zones[zone], &mut self.metrics[zone], dt_s);
-            self.leave_zone(&scenario, zone, now_s, dt_s);
+        for zone in 0..self.sites.len() {
+            let crosses = self.look(&scenario, zone, dt_s);
+            self.sites[zone].left_now = crosses;
+            if crosses {
+                self.cross(&scenario, zone, now_s, dt_s);
+                self.events.push(zone as ZoneId);
+            }
+            while let Some(Queue { road, path, .. }) =
+                self.gates.queues.get(queue).filter(|q| q.zone as usize == zone)
+            {
+                // The last of the path, be it one that has left in this very step: what matters is the road
+                // right behind it.
+                let at = self.cars[zone].iter().rposition(|c| c.path == *path);
+                let motion = at.map(|at| self.scratch.motions[at]);
+                self.scratch.leaders.push(Leader { road: *road, motion });
+                queue += 1;
+            }
             self.settle(zone, dt_s);
         }
-        for zone in 0..self.links.len() {
-            self.leave_link(&scenario, zone, now_s, dt_s);
-            self.links[zone].cars.iter_mut().for_each(|car| move_on(car, dt_s));
+        if self.on_links > 0 {
+            for zone in 0..self.links.len() {
+                self.leave_link(zone, now_s, dt_s);
+                self.links[zone].cars.iter_mut().for_each(|c| c.car.move_on(&c.held, dt_s));
+            }
         }
         self.admit(&scenario, now_s, dt_s);
         self.enter();
     }
 
-    /// Takes out the vehicles that pass the conflict point during the step and sends them on.
-    fn leave_zone(&mut self, scenario: &Scenario, index: usize, now_s: f64, dt_s: f64) {
-        let zone = &scenario.network.zones[index];
-        let traffic = &mut self.zones[index];
-        if let Some(left) = &mut traffic.left {
-            left.left_now = false;
+    /// Works out the motions of a zone's cars, updates the least rear-end margins over the step, and notes,
+    /// for vehicles seen for the first time, whether their entry conditions hold. Returns whether a vehicle
+    /// passes the conflict point.
+    fn look(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) -> bool {
+        let (phi, gap) = (scenario.vehicle.reaction_time_s, scenario.vehicle.standstill_gap_m);
+        let lengths_m = &self.lengths_m[zone];
+        let motions = &mut self.scratch.motions;
+        let cars = &mut self.cars[zone];
+        let mut crosses = false;
+        motions.clear();
+        motions.extend(cars.iter().map(Car::held));
+        for i in self.sites[zone].first()..cars.len() {
+            let (before, rest) = cars.split_at_mut(i);
+            let (car, held) = (&mut rest[0], &motions[i]);
+            let ahead_at = before.iter().rposition(|c| c.path == car.path);
+            if car.visit.entered {
+                let previous = before.last().filter(|c| c.path != car.path);
+                note_entry_conditions(scenario, lengths_m, car, ahead_at.map(|at| &before[at]), previous);
+            }
+            let after_s = held.passes_m(lengths_m[car.path as usize], dt_s);
+            crosses |= after_s.is_some();
+            let Some(at) = ahead_at else { continue };
+            let margin = held.least_margin_m(&motions[at], 0.0, phi, gap, after_s.unwrap_or(dt_s));
+            car.visit.least_rear_end_m = car.visit.least_rear_end_m.min(margin);
+            if before[at].x_m < car.x_m {
+                self.metrics[zone].overtakes += 1;
+            }
         }
-        let mut last: Option<(f64, Car)> = None;
-        let mut kept = 0;
-        for i in 0..traffic.cars.len() {
-            let car = traffic.cars[i];
-            let length_m = zone.approaches[car.path as usize].length_m;
-            let Some(after_s) = car.held.passes_m(length_m, dt_s) else {
-                traffic.cars[kept] = car;
+        crosses
+    }
+
+    /// Takes out the vehicles that pass the conflict point during the step and sends them on.
+    fn cross(&mut self, scenario: &Scenario, zone: usize, now_s: f64, dt_s: f64) {
+        let lengths_m = &self.lengths_m[zone];
+        let site = &mut self.sites[zone];
+        let metrics = &mut self.metrics[zone];
+        let motions = &mut self.scratch.motions;
+        let first_member = site.first();
+        let mut last: Option<(f64, Car, Held)> = None;
+        let mut kept = first_member;
+        let cars = &mut self.cars[zone];
+        for i in first_member..cars.len() {
+            let (car, held) = (cars[i], motions[i]);
+            let length_m = lengths_m[car.path as usize];
+            let Some(after_s) = held.passes_m(length_m, dt_s) else {
+                (cars[kept], motions[kept]) = (car, held);
                 kept += 1;
                 continue;
             };
-            let first = last.as_ref().is_none_or(|(instant, _)| *instant <= after_s);
-            let metrics = &mut self.metrics[index];
+            let first = last.as_ref().is_none_or(|(instant, ..)| *instant <= after_s);
             // A member kept so far entered earlier and is still inside.
-            metrics.order_violations += u32::from(kept > 0 || !first);
+            metrics.order_violations += u32::from(kept > first_member || !first);
             let mut visit = car.visit;
-            visit.energy += car.held.energy(after_s);
-            let previous =
-                if i > 0 { Some(&traffic.cars[i - 1]) } else { traffic.left.as_ref().map(|l| &l.car) };
-            // `cars[i - 1]` may have been overwritten by compaction only with itself or an earlier
-            // member, which is the case of an order violation.
-            let merge_margin_m = previous.filter(|p| p.path != car.path).map(|p| {
-                let shift = length_m - zone.approaches[p.path as usize].length_m;
-                p.held.position_m(after_s) + shift
+            visit.energy += held.energy(after_s);
+            // What has been kept has moved up, but never as far as the place before this one.
+            let previous = i.checked_sub(1).map(|at| (&cars[at], &motions[at]));
+            let merge_margin_m = previous.filter(|(p, _)| p.path != car.path).map(|(p, motion)| {
+                let shift = length_m - lengths_m[p.path as usize];
+                motion.position_m(after_s) + shift
                     - length_m
-                    - scenario.vehicle.reaction_time_s * car.held.speed_mps(after_s)
+                    - scenario.vehicle.reaction_time_s * held.speed_mps(after_s)
                     - scenario.vehicle.standstill_gap_m
             });
             let instant_s = now_s + after_s;
@@ -77,79 +133,75 @@ impl World {
             if let Some(visits) = &mut self.visits {
                 visits.push(CompletedVisit {
                     vehicle: car.vehicle,
-                    zone: index as u32,
+                    zone: zone as u32,
                     entry_time_s: car.entry_time_s,
                     exit_time_s: instant_s,
-                    exit_speed_mps: car.held.speed_mps(after_s),
+                    exit_speed_mps: held.speed_mps(after_s),
                     energy: visit.energy,
                     fe_s: visit.fe_s,
                 });
             }
             if first {
-                last = Some((after_s, car));
+                last = Some((after_s, car, held));
             }
-            let mut next = Car::entering(car.vehicle, 0, instant_s, car.held.speed_mps(after_s));
-            next.x_m = car.held.position_m(dt_s) - length_m;
-            next.v_mps = car.held.speed_mps(dt_s);
-            next.u_mps2 = car.held.observed_mps2(dt_s);
+            let Exit::Zone { zone: down, path, link_m } = site.exit else {
+                self.departed += 1;
+                continue;
+            };
+            let mut next = Car::entering(car.vehicle, path, instant_s, held.speed_mps(after_s));
+            next.move_on(&held, dt_s);
+            next.x_m -= length_m;
             // The rest of the step is driven under the old command and paid for in the new zone.
-            next.visit.energy = car.held.energy(dt_s) - car.held.energy(after_s);
-            next.planned_exit_time_s = 0.0;
-            match zone.exit {
-                Exit::Out => {
-                    self.departed += 1;
-                    self.held_u_mps2[car.vehicle as usize] = 0.0;
-                }
-                Exit::Zone { zone, path, link_m } => {
-                    next.path = path;
-                    if link_m > 0.0 {
-                        // Settled with the others on the link: its motion starts at the link's origin.
-                        next.held = Held::new(car.held.x0_m - length_m, car.held.v0_mps, car.held.u_mps2);
-                        self.links[index].cars.push(next);
-                    } else {
-                        self.entries.push(Entry { zone, car: next });
-                    }
-                }
+            next.visit.energy = held.energy(dt_s) - held.energy(after_s);
+            if link_m > 0.0 {
+                // Its motion starts at the link's origin.
+                let held = Held::new(held.x0_m - length_m, held.v0_mps, held.u_mps2);
+                self.links[zone].cars.push(LinkCar { car: next, held });
+                self.on_links += 1;
+            } else {
+                self.scratch.entries.push(Entry { zone: down, car: next });
             }
         }
-        traffic.cars.truncate(kept);
-        if let Some((_, car)) = last {
-            traffic.left = Some(LeftCar { car, left_now: true });
+        let (_, car, held) = last.expect("somebody crosses");
+        if !site.has_left {
+            // The first to leave makes room for itself.
+            cars.copy_within(..kept, 1);
+            motions.copy_within(..kept, 1);
+            kept += 1;
+            site.has_left = true;
+            self.with_left += 1;
         }
+        (cars[0], motions[0]) = (car, held);
+        site.left_from = zone as ZoneId;
+        self.cars.truncate(zone, kept);
     }
 
     /// Takes vehicles off the end of a link into the next zone.
-    fn leave_link(&mut self, scenario: &Scenario, index: usize, now_s: f64, dt_s: f64) {
-        let Exit::Zone { zone, path, .. } = scenario.network.zones[index].exit else { return };
-        let Link { length_m, cars } = &mut self.links[index];
-        while let Some(car) = cars.first() {
-            let Some(after_s) = car.held.passes_m(*length_m, dt_s) else { return };
-            let mut next = Car::entering(car.vehicle, path, now_s + after_s, car.held.speed_mps(after_s));
-            next.x_m = car.held.position_m(dt_s) - *length_m;
-            next.v_mps = car.held.speed_mps(dt_s);
-            next.u_mps2 = car.held.observed_mps2(dt_s);
-            next.visit.energy = car.held.energy(dt_s) - car.held.energy(after_s);
-            self.entries.push(Entry { zone, car: next });
+    fn leave_link(&mut self, zone: usize, now_s: f64, dt_s: f64) {
+        let Exit::Zone { zone: down, path, .. } = self.sites[zone].exit else { return };
+        let Link { length_m, cars } = &mut self.links[zone];
+        while let Some(LinkCar { car, held }) = cars.first() {
+            let Some(after_s) = held.passes_m(*length_m, dt_s) else { return };
+            let mut next = Car::entering(car.vehicle, path, now_s + after_s, held.speed_mps(after_s));
+            next.move_on(held, dt_s);
+            next.x_m -= *length_m;
+            next.visit.energy = held.energy(dt_s) - held.energy(after_s);
+            self.scratch.entries.push(Entry { zone: down, car: next });
             cars.remove(0);
+            self.on_links -= 1;
         }
     }
 
     /// Lets arrivals of this step in, as far as the road ahead of them allows.
     fn admit(&mut self, scenario: &Scenario, now_s: f64, dt_s: f64) {
-        self.gates.advance(scenario.time_s(self.step + 1));
         let vehicle = &scenario.vehicle;
         let gap_m = vehicle.length_m + vehicle.standstill_gap_m;
-        for (index, road) in scenario.network.roads.iter().enumerate() {
-            if self.gates.waiting[index].is_empty() {
-                continue;
-            }
-            let traffic = &self.zones[road.zone as usize];
-            let mut leader =
-                traffic.cars.iter().rev().find(|c| c.path == road.path).map(|c| c.held).or_else(|| {
-                    // It may have left in this very step; what matters is the road right behind it.
-                    traffic.left.as_ref().filter(|l| l.car.path == road.path).map(|l| l.car.held)
-                });
-            while let Some(waiting) = self.gates.waiting[index].front_mut() {
+        // Vehicles are numbered in order of road.
+        self.scratch.leaders.sort_unstable_by_key(|leader| leader.road);
+        for &Leader { road, motion: mut leader } in &self.scratch.leaders {
+            let waiting_here = &mut self.gates.waiting[road as usize];
+            let crate::scenario::Road { zone, path, .. } = scenario.network.roads[road as usize];
+            while let Some(waiting) = waiting_here.front_mut() {
                 let mut speed_mps = waiting.arrival.speed_mps;
                 // An arrival at the very end of the step may come out a rounding later.
                 let mut after_s = (waiting.arrival.time_s - now_s).min(dt_s);
@@ -167,88 +219,62 @@ impl World {
                     }
                     break;
                 }
-                self.gates.waiting[index].pop_front();
-                let id = self.held_u_mps2.len() as u32;
-                self.held_u_mps2.push(0.0);
-                let mut car = Car::entering(id, road.path, now_s + after_s, speed_mps);
+                waiting_here.pop_front();
+                let id = self.arrived;
+                self.arrived += 1;
+                let mut car = Car::entering(id, path, now_s + after_s, speed_mps);
                 let held = Held::new(-speed_mps * after_s, speed_mps, 0.0);
                 car.x_m = held.position_m(dt_s);
-                self.entries.push(Entry { zone: road.zone, car });
+                self.scratch.entries.push(Entry { zone, car });
                 leader = Some(held);
             }
         }
+        let waiting = &self.gates.waiting;
+        self.gates.queues.retain(|queue| !waiting[queue.road as usize].is_empty());
     }
 
     /// Moves everyone who stays in a zone to the end of the step.
     fn settle(&mut self, zone: usize, dt_s: f64) {
-        let traffic = &mut self.zones[zone];
-        if let Some(left) = &mut traffic.left {
-            move_on(&mut left.car, dt_s);
+        let (left, members) = self.cars[zone].split_at_mut(self.sites[zone].first());
+        let (left_motions, motions) = self.scratch.motions.split_at(left.len());
+        for (car, held) in left.iter_mut().zip(left_motions) {
+            car.move_on(held, dt_s);
         }
-        for car in &mut traffic.cars {
-            car.visit.energy += car.held.energy(dt_s);
-            car.entered = false;
-            move_on(car, dt_s);
+        for (car, held) in members.iter_mut().zip(motions) {
+            car.visit.energy += held.energy(dt_s);
+            car.visit.entered = false;
+            car.move_on(held, dt_s);
         }
     }
 
     /// Appends the newcomers to their zones, by instant of entry, then path.
     fn enter(&mut self) {
-        self.entries.sort_by(|a, b| {
+        let entries = &mut self.scratch.entries;
+        if entries.is_empty() {
+            return;
+        }
+        entries.sort_by(|a, b| {
             let key = |e: &Entry| (e.zone, e.car.entry_time_s, e.car.path);
             key(a).partial_cmp(&key(b)).expect("instants of entry are finite")
         });
-        for entry in &self.entries {
-            self.zones[entry.zone as usize].cars.push(entry.car);
+        for entry in entries {
+            self.cars.push(entry.zone as usize, entry.car);
+            self.events.push(entry.zone);
         }
-    }
-}
-
-/// Moves a vehicle to the end of the step.
-fn move_on(car: &mut Car, dt_s: f64) {
-    car.x_m = car.held.position_m(dt_s);
-    car.v_mps = car.held.speed_mps(dt_s);
-    car.u_mps2 = car.held.observed_mps2(dt_s);
-}
-
-/// Updates the least rear-end margins over the step and notes, for vehicles seen for the first time,
-/// whether their entry conditions hold.
-fn account_margins(
-    scenario: &Scenario,
-    index: usize,
-    traffic: &mut Traffic,
-    metrics: &mut ZoneMetrics,
-    dt_s: f64,
-) {
-    let zone = &scenario.network.zones[index];
-    let (phi, gap) = (scenario.vehicle.reaction_time_s, scenario.vehicle.standstill_gap_m);
-    for i in 0..traffic.cars.len() {
-        let (before, rest) = traffic.cars.split_at_mut(i);
-        let car = &mut rest[0];
-        let left = traffic.left.as_ref().map(|l| &l.car);
-        let ahead = before.iter().rev().find(|c| c.path == car.path).or(left.filter(|c| c.path == car.path));
-        if car.entered {
-            let previous = before.last().or(left).filter(|c| c.path != car.path);
-            note_entry_conditions(scenario, zone, car, ahead, previous);
-        }
-        let Some(ahead) = ahead else { continue };
-        let length_m = zone.approaches[car.path as usize].length_m;
-        let within_s = car.held.passes_m(length_m, dt_s).unwrap_or(dt_s);
-        let margin = car.held.least_margin_m(&ahead.held, 0.0, phi, gap, within_s);
-        car.visit.least_rear_end_m = car.visit.least_rear_end_m.min(margin);
-        metrics.overtakes += u32::from(ahead.x_m < car.x_m);
+        self.events.sort_unstable();
+        self.events.dedup();
     }
 }
 
 fn note_entry_conditions(
     scenario: &Scenario,
-    zone: &Zone,
+    lengths_m: &[f64],
     car: &mut Car,
     ahead: Option<&Car>,
     previous: Option<&Car>,
 ) {
     let (vehicle, control) = (&scenario.vehicle, &scenario.control);
-    let length = |path: u32| zone.approaches[path as usize].length_m;
+    let length = |path: u32| lengths_m[path as usize];
     let own_length_m = length(car.path);
     let pair = |x_m: f64, v_mps: f64, partner: &Car| Pair {
         x_m,

@@ -8,7 +8,16 @@ use crate::vehicle::{Held, Pair, RearEnd};
 #[derive(Clone, Debug, Default)]
 pub(super) struct Link {
     pub length_m: f64,
-    pub cars: Vec<Car>,
+    pub cars: Vec<LinkCar>,
+}
+
+/// A vehicle on a link.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct LinkCar {
+    pub car: Car,
+    /// Motion over the coming step, chosen by its driver; in the step in which it came, what it had been
+    /// commanded.
+    pub held: Held,
 }
 
 /// Time constant with which a vehicle on a link goes back to the speed it entered with, s.

@@ -1,74 +1,94 @@
 //! The world as a state machine: state frame out, command frames in, one step on.
 
-use super::car::{Car, LeftCar};
+use super::car::Car;
 use super::gate::Gates;
 use super::gateway::Gateway;
+use super::integrate::{Entry, Leader};
 use super::link::Link;
 use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics};
+use crate::lanes::Lanes;
 use crate::scenario::share::{neighbour_coordinators, zones_of};
-use crate::scenario::{Exit, Scenario};
+use crate::scenario::{Exit, Scenario, ZoneId};
+use crate::vehicle::Held;
 use ipc_schemas::{self as frames, VehicleState};
+use std::ops::Range;
 use std::sync::Arc;
 use xxhash_rust::xxh3::xxh3_64_with_seed;
 
 /// The world.
+///
+/// What a step touches in every zone is kept in arrays by zone, as narrow as can be: in a large network the
+/// time of a step is the time it takes to fetch them.
 #[derive(Debug)]
 pub struct World {
     pub(super) scenario: Arc<Scenario>,
     pub(super) step: u64,
-    pub(super) zones: Vec<Traffic>,
+    /// The paper's S(t) of each zone: index 0, where there is one (see [`Site`]), and the members in order
+    /// of entry.
+    pub(super) cars: Lanes<Car>,
+    pub(super) sites: Vec<Site>,
+    /// Zones that have an index 0.
+    pub(super) with_left: usize,
+    /// Lengths of each zone's approaches, m.
+    pub(super) lengths_m: Lanes<f64>,
     /// The link behind each zone's exit; never used when the length is 0.
     pub(super) links: Vec<Link>,
+    pub(super) on_links: usize,
     pub(super) gates: Gates,
-    /// Acceleration every vehicle so far holds over the step being integrated, by vehicle id; 0 once it
-    /// has left the network. Lets a zone's index 0 move with the vehicle it stands for.
-    pub(super) held_u_mps2: Vec<f64>,
+    pub(super) arrived: u32,
     pub(super) departed: u32,
     pub(super) metrics: Vec<ZoneMetrics>,
-    pub(super) entries: Vec<super::integrate::Entry>,
     /// Completed visits in the order in which they ended, when they are recorded.
     pub(super) visits: Option<Vec<CompletedVisit>>,
+    /// Zones that had an event in the step just ended, ascending.
+    pub(super) events: Vec<ZoneId>,
+    pub(super) scratch: Scratch,
     state_hash: u64,
     /// Zones of each coordinator process, their neighbour processes, and who had an event.
     coordinators: Vec<CoordinatorShare>,
-    /// Per zone: an event in the step just ended, an event one step earlier, acts in the present step.
-    marks: Vec<ZoneMarks>,
+    neighbours: Lanes<ZoneId>,
+    /// Zones to which their neighbours' events of the step before are new.
+    told: Vec<ZoneId>,
+    /// Zones that act in the present step, ascending.
+    acting: Vec<ZoneId>,
     summarised: u64,
     pub(super) commanded: u32,
     pub(super) gateway: Gateway,
 }
 
-#[derive(Clone, Copy, Debug, Default)]
-struct ZoneMarks {
-    event: bool,
-    event_before: bool,
-    acts: bool,
+/// What there is to know of a zone beside its vehicles.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Site {
+    pub exit: Exit,
+    /// Whether the first of the zone's cars is index 0 of the paper's S(t): the vehicle that left last.
+    pub has_left: bool,
+    /// It left during the step just ended.
+    pub left_now: bool,
+    /// The last zone it is known to have left.
+    pub left_from: ZoneId,
 }
 
-/// The vehicles of one zone.
-#[derive(Clone, Debug, Default)]
-pub(super) struct Traffic {
-    /// Index 0 of the paper's S(t).
-    pub left: Option<LeftCar>,
-    /// Members in order of entry.
-    pub cars: Vec<Car>,
+impl Site {
+    /// Place of the first member among the zone's cars.
+    pub(super) fn first(&self) -> usize {
+        usize::from(self.has_left)
+    }
 }
 
-impl Traffic {
-    fn record_count(&self) -> usize {
-        self.cars.len() + usize::from(self.left.is_some())
-    }
-
-    /// Whether a vehicle entered or left in the step just ended.
-    fn has_event(&self) -> bool {
-        // Newcomers are appended, so the last member is one if any is.
-        self.left.is_some_and(|l| l.left_now) || self.cars.last().is_some_and(|c| c.entered)
-    }
+/// Lists that live for a part of a step; kept for their allocations.
+#[derive(Debug, Default)]
+pub(super) struct Scratch {
+    /// Motion of each car of a zone over the step.
+    pub motions: Vec<Held>,
+    /// Vehicles about to enter a zone.
+    pub entries: Vec<Entry>,
+    /// What newcomers on a road find ahead of them.
+    pub leaders: Vec<Leader>,
 }
 
 #[derive(Debug)]
 struct CoordinatorShare {
-    zones: std::ops::Range<u32>,
+    zones: Range<u32>,
     neighbours: u64,
 }
 
@@ -85,6 +105,11 @@ impl World {
                 neighbours,
             })
             .collect();
+        let (mut lengths_m, mut neighbours) = (Lanes::new(zones), Lanes::new(zones));
+        for (i, zone) in network.zones.iter().enumerate() {
+            zone.approaches.iter().for_each(|a| lengths_m.push(i, a.length_m));
+            network.neighbours(i as ZoneId).for_each(|n| neighbours.push(i, n));
+        }
         let links = network
             .zones
             .iter()
@@ -93,19 +118,27 @@ impl World {
                 Exit::Out => Link::default(),
             })
             .collect();
+        let site = |exit| Site { exit, has_left: false, left_now: false, left_from: 0 };
         World {
             step: 0,
-            zones: vec![Traffic::default(); zones],
+            cars: Lanes::new(zones),
+            sites: network.zones.iter().map(|z| site(z.exit)).collect(),
+            with_left: 0,
+            lengths_m,
             links,
+            on_links: 0,
             gates: Gates::new(&scenario),
-            held_u_mps2: Vec::new(),
+            arrived: 0,
             departed: 0,
             metrics: vec![ZoneMetrics::default(); zones],
-            entries: Vec::new(),
             visits: None,
+            events: Vec::new(),
+            scratch: Scratch::default(),
             state_hash: 0,
             coordinators: shares,
-            marks: vec![ZoneMarks::default(); zones],
+            neighbours,
+            told: Vec::new(),
+            acting: Vec::new(),
             summarised: 0,
             commanded: 0,
             gateway: Gateway::new(&scenario, scenario.controllers(1)),
@@ -131,9 +164,17 @@ impl World {
     /// Whether the run is over: all demand served, or out of time.
     pub fn is_finished(&self) -> bool {
         self.scenario.time_s(self.step) >= self.scenario.max_time_s
-            || (self.gates.exhausted()
-                && self.zones.iter().all(|z| z.cars.is_empty())
-                && self.links.iter().all(|l| l.cars.is_empty()))
+            || (self.gates.exhausted() && self.on_links == 0 && self.member_count() == 0)
+    }
+
+    /// Vehicles in zones.
+    fn member_count(&self) -> usize {
+        self.cars.total() - self.with_left
+    }
+
+    /// The members of a zone in order of entry.
+    pub(super) fn members(&self, zone: usize) -> &[Car] {
+        &self.cars[zone][self.sites[zone].first()..]
     }
 
     /// Keeps every visit completed from now on; nobody's motion or hash depends on it.
@@ -148,7 +189,7 @@ impl World {
 
     /// Vehicles that have entered the network so far.
     pub fn arrived(&self) -> u32 {
-        self.held_u_mps2.len() as u32
+        self.arrived
     }
 
     /// Vehicles that have left the network so far.
@@ -158,45 +199,41 @@ impl World {
 
     /// The number of records of the present state frame.
     pub fn record_count(&self) -> usize {
-        let in_zones: usize = self.zones.iter().map(Traffic::record_count).sum();
-        in_zones + self.links.iter().map(|l| l.cars.len()).sum::<usize>()
+        self.cars.total() + self.on_links
     }
 
     /// The number of records of the frame for a coordinator process.
     pub fn coordinator_record_count(&self, coordinator: u32) -> usize {
-        self.acting_zones(coordinator).map(|z| self.zones[z].record_count()).sum()
+        self.acting_zones(coordinator).iter().map(|&z| self.cars[z as usize].len()).sum()
     }
 
     /// The records of the frame for a coordinator process: those of its zones that act in this step.
     pub fn coordinator_records(&self, coordinator: u32) -> impl Iterator<Item = VehicleState> + '_ {
-        self.acting_zones(coordinator).flat_map(|z| self.zone_records(z))
+        self.acting_zones(coordinator).iter().flat_map(|&z| self.zone_records(z))
     }
 
-    fn acting_zones(&self, coordinator: u32) -> impl Iterator<Item = usize> + '_ {
-        let zones = self.coordinators[coordinator as usize].zones.clone();
-        (zones.start as usize..zones.end as usize).filter(|&z| self.marks[z].acts)
+    fn acting_zones(&self, coordinator: u32) -> &[ZoneId] {
+        within(&self.acting, &self.coordinators[coordinator as usize].zones)
     }
 
     /// The records of the present state frame (see [`VehicleState`] for their order).
     pub fn records(&self) -> impl Iterator<Item = VehicleState> + '_ {
-        let in_zones = (0..self.zones.len()).flat_map(|z| self.zone_records(z));
-        let on_links =
-            self.links.iter().flat_map(|link| link.cars.iter().map(|c| self.record(c, frames::NO_ZONE, 0)));
-        in_zones.chain(on_links)
+        let in_zones = (0..self.sites.len() as ZoneId).flat_map(|z| self.zone_records(z));
+        // Most networks have no links: an empty range spares the walk over them.
+        let links = if self.on_links == 0 { &[][..] } else { &self.links[..] };
+        let on_links = links.iter().flat_map(|link| &link.cars);
+        in_zones.chain(on_links.map(|c| self.record(&c.car, frames::NO_ZONE, 0)))
     }
 
     /// A zone's S(t).
-    fn zone_records(&self, zone: usize) -> impl Iterator<Item = VehicleState> + '_ {
-        let traffic = &self.zones[zone];
-        let left = traffic.left.iter().map(move |l| {
-            let now = if l.left_now { frames::STATE_LEFT_NOW } else { 0 };
-            self.record(&l.car, zone as u32, frames::STATE_LEFT | now)
-        });
-        let members = traffic
-            .cars
+    fn zone_records(&self, zone: ZoneId) -> impl Iterator<Item = VehicleState> + '_ {
+        let site = &self.sites[zone as usize];
+        let left_flags = frames::STATE_LEFT | if site.left_now { frames::STATE_LEFT_NOW } else { 0 };
+        let (left, members) = self.cars[zone as usize].split_at(site.first());
+        let members = members
             .iter()
-            .map(move |c| self.record(c, zone as u32, if c.entered { frames::STATE_ENTERED } else { 0 }));
-        left.chain(members)
+            .map(move |c| self.record(c, zone, if c.visit.entered { frames::STATE_ENTERED } else { 0 }));
+        left.iter().map(move |c| self.record(c, zone, left_flags)).chain(members)
     }
 
     fn record(&self, car: &Car, zone: u32, flags: u16) -> VehicleState {
@@ -232,19 +269,16 @@ impl World {
     /// A process acts when one of its zones has an event, when one had an event in the previous step
     /// (its other zones hear of it now), or when a neighbouring process had one then.
     pub fn coordinator_masks(&mut self) -> CoordinatorMasks {
-        for (marks, traffic) in self.marks.iter_mut().zip(&self.zones) {
-            marks.event_before = marks.event;
-            marks.event = traffic.has_event();
-        }
-        for zone in 0..self.marks.len() {
-            let told =
-                self.scenario.network.neighbours(zone as u32).any(|n| self.marks[n as usize].event_before);
-            self.marks[zone].acts = self.marks[zone].event || told;
-        }
+        self.acting.clear();
+        self.acting.append(&mut self.told);
+        self.acting.extend_from_slice(&self.events);
+        self.acting.sort_unstable();
+        self.acting.dedup();
+        let neighbours = self.events.iter().flat_map(|&zone| &self.neighbours[zone as usize]);
+        self.told.extend(neighbours);
         let mut events = 0u64;
         for (i, share) in self.coordinators.iter().enumerate() {
-            let own = &self.marks[share.zones.start as usize..share.zones.end as usize];
-            if own.iter().any(|marks| marks.event) {
+            if !within(&self.events, &share.zones).is_empty() {
                 events |= 1 << i;
             }
         }
@@ -268,7 +302,7 @@ impl World {
     /// # Errors
     /// The number of vehicles without a command, when there are any.
     pub fn advance(&mut self) -> Result<(), usize> {
-        let vehicles: usize = self.zones.iter().map(|z| z.cars.len()).sum();
+        let vehicles = self.member_count();
         let commanded = std::mem::take(&mut self.commanded) as usize;
         if commanded != vehicles {
             return Err(vehicles.abs_diff(commanded));
@@ -280,7 +314,7 @@ impl World {
 
     /// The results so far.
     pub fn summary(&self) -> WorldSummary {
-        let zones = self.scenario.network.zones.iter().zip(&self.metrics).zip(&self.zones);
+        let zones = self.scenario.network.zones.iter().zip(&self.metrics).enumerate();
         WorldSummary {
             steps: self.step,
             state_hash: self.state_hash,
@@ -290,14 +324,21 @@ impl World {
             waiting: self.gates.waiting.iter().map(|w| w.len() as u32).sum(),
             shield: self.gateway.summary(),
             zones: zones
-                .map(|((zone, metrics), traffic)| {
+                .map(|(i, (zone, metrics))| {
                     let mut metrics = metrics.clone();
-                    traffic.cars.iter().for_each(|car| metrics.observe(&car.visit));
+                    self.members(i).iter().for_each(|car| metrics.observe(&car.visit));
                     metrics.row(&zone.name, self.scenario.beta)
                 })
                 .collect(),
         }
     }
+}
+
+/// Those of the zones, which ascend, that are in the range.
+fn within<'a>(zones: &'a [ZoneId], range: &Range<ZoneId>) -> &'a [ZoneId] {
+    let from = zones.partition_point(|&zone| zone < range.start);
+    let to = zones.partition_point(|&zone| zone < range.end);
+    &zones[from..to]
 }
 
 /// Bit `i` stands for coordinator process `i`.
