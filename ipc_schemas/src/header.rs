@@ -15,6 +15,9 @@ codes! {
 
     /// [`FrameHeader::flags`]: this is the last state frame of the run; answer nothing, detach.
     pub const FLAG_END_OF_RUN: u32 = 1;
+    /// [`FrameHeader::flags`]: in the step before, the world put in commands for a controller that had not
+    /// answered in time. What the controllers remember is what was applied, not what they sent.
+    pub const FLAG_MISSED: u32 = 2;
 }
 
 /// Who sent a frame; the value of [`FrameHeader::sender_role`].
@@ -81,7 +84,7 @@ record! {
         pub generation: u32,
         /// Number of records that follow.
         pub record_count: u32,
-        /// Bit 0: end of run.
+        /// Bit 0: end of run. Bit 1: commands were put in in the step before.
         pub flags: u32,
     }
 }

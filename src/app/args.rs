@@ -1,11 +1,12 @@
 //! Command-line arguments.
 
-use crate::process::{Placement, WaitMode};
+use super::AppError;
+use crate::process::{OnMiss, Pace, Placement, Timing, WaitMode};
 use crate::reproduce::cli::ReproduceArgs;
 use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
 use crate::scenario::{Override, Scenario, ScenarioError, load};
 use crate::transport::iox::RunName;
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -224,19 +225,19 @@ pub(super) struct ShareArgs {
 
 impl ShareArgs {
     /// Refuses more processes than there are zones to share out.
-    pub fn check(&self, scenario: &Scenario) -> Result<(), super::AppError> {
+    pub fn check(&self, scenario: &Scenario) -> Result<(), AppError> {
         let zones = scenario.network.zones.len() as u32;
         for (name, count) in [("--ctrl-procs", self.ctrl_procs), ("--coord-procs", self.coord_procs)] {
             if count > zones {
                 let scenario = &scenario.name;
-                return Err(super::AppError::Usage(format!(
+                return Err(AppError::Usage(format!(
                     "{name} {count}: expected at most {zones}, the number of zones of scenario {scenario}"
                 )));
             }
         }
         let (controllers, plugins) = (scenario.controllers(self.ctrl_procs), scenario.plugins.len());
         if controllers > MAX_CONTROLLERS {
-            return Err(super::AppError::Usage(format!(
+            return Err(AppError::Usage(format!(
                 "--ctrl-procs {}: with the scenario's {plugins} controllers, expected at most {MAX_CONTROLLERS}",
                 self.ctrl_procs
             )));
@@ -266,6 +267,48 @@ fn seconds(text: &str) -> Result<Duration, String> {
     match text.parse::<f64>() {
         Ok(s) if s > 0.0 && s <= 86_400.0 => Ok(Duration::from_secs_f64(s)),
         _ => Err("expected a number of seconds > 0 and <= 86400".to_owned()),
+    }
+}
+
+/// When steps begin, and what becomes of late ones.
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub(super) struct TimingArgs {
+    /// Begin each step as soon as the one before is done, or at its instant in real time.
+    #[arg(long, value_enum, default_value_t = Pace::Free)]
+    pub pace: Pace,
+    /// Time a step may take [default: with `--pace realtime` the step length, otherwise any].
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub deadline: Option<Duration>,
+    /// What to do about controllers that have not answered by the deadline.
+    #[arg(long, value_enum, default_value_t = OnMiss::Wait)]
+    pub on_miss: OnMiss,
+}
+
+impl TimingArgs {
+    /// What they mean.
+    pub fn timing(&self) -> Result<Timing, AppError> {
+        let TimingArgs { pace, deadline, on_miss } = *self;
+        if on_miss != OnMiss::Wait && pace == Pace::Free && deadline.is_none() {
+            let problem =
+                "--on-miss: without a deadline nothing is missed; add --pace realtime or --deadline";
+            return Err(AppError::Usage(problem.to_owned()));
+        }
+        Ok(Timing { pace, deadline, on_miss })
+    }
+
+    /// Whether anything is asked for.
+    pub fn is_given(&self) -> bool {
+        self.pace != Pace::Free || self.deadline.is_some()
+    }
+
+    /// As a process of the run is given them.
+    pub fn to_flags(self) -> Vec<String> {
+        let name =
+            |v: Option<clap::builder::PossibleValue>| v.map_or_else(String::new, |v| v.get_name().to_owned());
+        let mut flags = vec!["--pace".to_owned(), name(self.pace.to_possible_value())];
+        flags.extend(["--on-miss".to_owned(), name(self.on_miss.to_possible_value())]);
+        flags.extend(self.deadline.map(|d| format!("--deadline={}", d.as_secs_f64())));
+        flags
     }
 }
 
@@ -312,6 +355,8 @@ pub(super) struct RunArgs {
     /// What becomes of the run when a coordinator or a process of the built-in pool dies.
     #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
     pub restart: Restart,
+    #[command(flatten)]
+    pub timing: TimingArgs,
 }
 
 #[derive(Debug, Args)]
@@ -334,6 +379,8 @@ pub(super) struct WorldArgs {
     /// What becomes of the run when a coordinator or a process of the built-in pool dies.
     #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
     pub restart: Restart,
+    #[command(flatten)]
+    pub timing: TimingArgs,
     /// Process id of the supervisor: report to it on stdout, and end with it.
     #[arg(long, hide = true, value_name = "PID")]
     pub supervised: Option<u32>,

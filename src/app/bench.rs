@@ -1,6 +1,6 @@
 //! `cz bench`: measurements.
 
-use super::args::{BenchArgs, BenchKind, PeerArgs, Restart, ScenarioArgs, ShareArgs, WaitArgs};
+use super::args::{BenchArgs, BenchKind, PeerArgs, Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs};
 use super::supervise::{Plan, supervise};
 use super::{AppError, print};
 use crate::bench::{
@@ -76,6 +76,7 @@ fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, S
         wait: WAIT,
         wait_mode: WaitMode::Hybrid,
         restart: Restart::Never,
+        timing: TimingArgs::default(),
     };
     supervise(&plan, |_| {}).map_err(|e| e.to_string())
 }

@@ -30,6 +30,7 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         peer_timeout: args.wait.peer_timeout,
         wait: args.wait_mode,
         replace: args.restart == Restart::OnFailure,
+        timing: args.timing.timing()?,
     };
     let hot_processes = args.wait_mode.hot_processes(options.coordinators, options.controllers);
     let report = report_to(args.supervised, &args.wait);

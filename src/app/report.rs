@@ -2,7 +2,7 @@
 
 use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
-use crate::process::{LatencyUs, Outcome, Replacement, Settled};
+use crate::process::{LatencyUs, Outcome, Punctuality, Replacement, Settled};
 use crate::scenario::{Scenario, ShieldMode};
 use crate::world::{ShieldSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
@@ -32,6 +32,8 @@ pub(super) struct Summary {
     replacements: Vec<Replacement>,
     refused: Vec<RefusedFrames>,
     late_frames: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    punctuality: Option<Punctuality>,
     placement: Vec<Settled>,
     /// Whether the table says so too: somebody has asked for something.
     #[serde(skip)]
@@ -73,6 +75,7 @@ impl Summary {
             replacements: outcome.replacements,
             refused: outcome.refused,
             late_frames: outcome.late_frames,
+            punctuality: outcome.punctuality,
             placement: outcome.placement,
             show_placement: false,
         }
@@ -164,6 +167,9 @@ impl Summary {
             ));
         }
         shield_lines(&self.shield, &mut text);
+        if let Some(p) = &self.punctuality {
+            text.push_str(&punctuality_lines(p));
+        }
         for r in &self.replacements {
             text.push_str(&format!(
                 "{} was replaced at step {} (generation {}); the step took {:.1} ms\n",
@@ -179,6 +185,31 @@ impl Summary {
         text.push_str(&format!("state hash {}\n", self.state_hash));
         text
     }
+}
+
+fn punctuality_lines(p: &Punctuality) -> String {
+    let mut text = String::new();
+    if p.paced {
+        let l = &p.lateness_ns;
+        let us = |ns: u64| ns as f64 / 1e3;
+        text.push_str(&format!(
+            "states published after their instants: p50 {:.1} µs, p90 {:.1}, p99 {:.1}, p99.9 {:.1}, max {:.1}\n",
+            us(l.p50),
+            us(l.p90),
+            us(l.p99),
+            us(l.p999),
+            us(l.max)
+        ));
+    }
+    text.push_str(&format!("{} deadlines of {:.0} µs missed", p.missed_steps, p.deadline_us));
+    for by in &p.missed_by {
+        text.push_str(&format!(", {} by {}", by.steps, by.participant));
+    }
+    if p.began_late > 0 {
+        text.push_str(&format!(", {} because earlier steps had taken too long", p.began_late));
+    }
+    text.push('\n');
+    text
 }
 
 /// One line per controller the shield had something to say about.

@@ -30,6 +30,12 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         let problem = "--record: runs of several processes cannot be recorded yet; add --in-process";
         return Err(AppError::Usage(problem.to_owned()));
     }
+    args.timing.timing()?;
+    if args.in_process && args.timing.is_given() {
+        let problem =
+            "--in-process: nobody else can be late; --pace and --deadline are for several processes";
+        return Err(AppError::Usage(problem.to_owned()));
+    }
     let bar = Bar::new(&scenario);
     let mut recorded = Ok(());
     let (transport, outcome) = if args.in_process {
@@ -62,6 +68,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
             wait: args.wait,
             wait_mode: args.wait_mode,
             restart: args.restart,
+            timing: args.timing,
         };
         (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
     };

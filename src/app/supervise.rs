@@ -1,7 +1,7 @@
 //! The supervisor: starts the processes of a run, watches them, and leaves nothing behind.
 
 use super::AppError;
-use super::args::{Restart, ScenarioArgs, ShareArgs, WaitArgs};
+use super::args::{Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs};
 use super::run::Position;
 use crate::process::{Outcome, ProcessError, Settled, WaitMode};
 use crate::scenario::Plugin;
@@ -61,6 +61,8 @@ pub(super) struct Plan<'a> {
     pub pool: u32,
     /// What becomes of the run when a participant dies.
     pub restart: Restart,
+    /// When steps begin, and what becomes of late ones.
+    pub timing: TimingArgs,
 }
 
 /// A part that dies this often, each time soon after it was started, is given up.
@@ -174,6 +176,7 @@ impl Family {
         world.extend(["--coord-procs".to_owned(), plan.share.coord_procs.to_string()]);
         world.extend(["--wait".to_owned(), name(plan.wait_mode.to_possible_value())]);
         world.extend(["--restart".to_owned(), name(plan.restart.to_possible_value())]);
+        world.extend(plan.timing.to_flags());
         world.extend(plan.scenario.to_arguments());
         self.spawn(Part { name: "world".to_owned(), command: "world", arguments: world, restarts: 0 })?;
         for (role, command, count) in

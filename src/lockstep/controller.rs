@@ -6,7 +6,7 @@ use super::{Awaited, Handover, Identity, InHand, LockstepError, Progress, Refusa
 use crate::control::ControllerPool;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use ipc_schemas::{
-    Assignment, ExpectedHeader, FLAG_END_OF_RUN, HeaderFault, Role, VehicleCommand, VehicleState,
+    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, HeaderFault, Role, VehicleCommand, VehicleState,
 };
 
 /// A controller's ends of the services.
@@ -107,7 +107,7 @@ where
             // It was handed over with the rest, or the run went on without this one.
             return Ok(Progress::Advanced);
         }
-        if header.step > step {
+        if header.step > step || header.flags & FLAG_MISSED != 0 {
             return Ok(Progress::Behind);
         }
         let missing = header.coordinators_acting;

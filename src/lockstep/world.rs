@@ -8,7 +8,8 @@ use crate::scenario::share::zones_of;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use crate::world::World;
 use ipc_schemas::{
-    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault, Role, VehicleCommand, VehicleState,
+    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, HeaderFault, Role, VehicleCommand,
+    VehicleState,
 };
 
 /// The world's ends of the services.
@@ -62,6 +63,8 @@ where
     /// Whoever has sent something it should not have in this step, in its own name.
     suspect: Option<(Role, u16)>,
     header: FrameHeader,
+    /// Controllers for which the world put in commands in the present step, or the last one.
+    put_in: u64,
     phase: Phase,
 }
 
@@ -109,6 +112,7 @@ where
             detained: (Vec::new(), Vec::new()),
             suspect: None,
             header: FrameHeader::default(),
+            put_in: 0,
             phase: Phase::Publish,
         }
     }
@@ -126,6 +130,41 @@ where
     /// Whether a coordinator acted in the step published last.
     pub fn was_event(&self) -> bool {
         self.header.coordinators_acting != 0
+    }
+
+    /// Whether the next thing to do is to publish a step's state.
+    pub fn is_between_steps(&self) -> bool {
+        matches!(self.phase, Phase::Publish)
+    }
+
+    /// Whether controllers have to take over anew in this step before they can answer.
+    pub fn expects_requests(&self) -> bool {
+        self.header.flags & FLAG_MISSED != 0
+    }
+
+    /// Goes on without the controllers that have not answered: their vehicles hold what they had, on the
+    /// terms of `verdict` (`VERDICT_HELD` or `VERDICT_FALLBACK`). Returns whether that was possible; while a
+    /// coordinator is waited for, nobody knows what the controllers would be up against.
+    ///
+    /// # Errors
+    /// When the step cannot be ended.
+    pub fn put_in(&mut self, verdict: u16) -> Result<bool, LockstepError> {
+        let (Phase::Collect(missing), Some(ledger)) = (self.phase, &mut self.ledger) else {
+            return Ok(false);
+        };
+        if missing.coordination != 0 {
+            return Ok(false);
+        }
+        for index in (0..self.controllers.len()).filter(|i| missing.commands >> i & 1 == 1) {
+            let commands = self.world.substitute(index as u32, ledger.commands_before(index), verdict);
+            self.world.command(index as u32, &commands).expect(
+                "what the world puts in has each of the controller's vehicles once, within its limits",
+            );
+            ledger.substitute(index, commands);
+        }
+        self.put_in = missing.commands;
+        self.finish_step()?;
+        Ok(true)
     }
 
     /// What was refused, by sender.
@@ -199,10 +238,11 @@ where
         let finished = self.world.is_finished();
         let masks = self.world.coordinator_masks();
         let step = self.world.step();
+        let put_in = std::mem::take(&mut self.put_in);
         let header = FrameHeader {
             coordinators_acting: masks.acting,
             coordinators_summarised: masks.summarised,
-            flags: if finished { FLAG_END_OF_RUN } else { 0 },
+            flags: if finished { FLAG_END_OF_RUN } else { 0 } | if put_in != 0 { FLAG_MISSED } else { 0 },
             ..self.identity.header(step, self.world.time_ns())
         };
         // Coordinators first: theirs is the longer way.

@@ -1,6 +1,7 @@
 //! The processes of a run: thin shells that give the pure roles a clock, signals and a transport.
 
 mod attach;
+mod pace;
 mod participant;
 mod peers;
 mod placement;
@@ -12,6 +13,7 @@ mod wait;
 mod world;
 
 pub use attach::{Attachment, Joining};
+pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
 pub use placement::{Affinity, Placement, place, unplaced};
@@ -100,6 +102,12 @@ pub enum ProcessError {
         awaited: Awaited,
         /// How long.
         seconds: f64,
+    },
+    /// A step was not done by its deadline, in a run that ends then.
+    #[error("the deadline of step {} was missed: no {awaited}", .awaited.step)]
+    DeadlineMissed {
+        /// What had not come.
+        awaited: Awaited,
     },
     /// A participant sent what it should not have and nothing better since.
     #[error("{who} sent a frame that cannot be taken, and no good one since: {fault}")]

@@ -1,7 +1,11 @@
 //! The world process.
 
 use super::attach::{Readiness, Reception};
-use super::{Patience, Peer, Peers, ProcessError, Settled, StopFlag, WaitMode, Waiter};
+use super::pace::Pacer;
+use super::{
+    OnMiss, Pace, Patience, Peer, Peers, ProcessError, Punctuality, Settled, StopFlag, Timing, WaitMode,
+    Waiter,
+};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Awaited, Progress, RefusedFrames, Seat, WorldDriver, WorldPorts};
 use crate::record::StepFrames;
@@ -34,6 +38,15 @@ pub struct WorldOptions {
     /// Whether the run waits, as long as for a frame, for somebody to take the place of a coordinator or
     /// controller that has died.
     pub replace: bool,
+    /// When steps begin, and what becomes of late ones.
+    pub timing: Timing,
+}
+
+impl WorldOptions {
+    /// Whether the world keeps what others need who take a place, or catch up.
+    fn keeps(&self) -> bool {
+        self.replace || self.timing.on_miss.verdict().is_some()
+    }
 }
 
 /// Percentiles of the time a step takes, from the state's publication to the end of integration, us.
@@ -70,6 +83,8 @@ pub struct Outcome {
     pub refused: Vec<RefusedFrames>,
     /// Answers that came too late or twice.
     pub late_frames: u64,
+    /// How punctual the run was, where it had a schedule or deadlines.
+    pub punctuality: Option<Punctuality>,
     /// Where each process was and what it was granted; filled in by who started them.
     #[serde(default)]
     pub placement: Vec<Settled>,
@@ -168,6 +183,13 @@ impl StepMeter {
         }
     }
 
+    /// A step begins now.
+    fn begin_step(&mut self, is_paced: bool) {
+        if is_paced {
+            self.step_start = Instant::now();
+        }
+    }
+
     /// Returns how long the step took, ns.
     fn step_done(&mut self, was_event: bool) -> u64 {
         let now = Instant::now();
@@ -198,6 +220,7 @@ impl StepMeter {
             replacements: history.replacements,
             refused: history.refused,
             late_frames: history.late_frames,
+            punctuality: history.punctuality,
             placement: Vec::new(),
         }
     }
@@ -209,6 +232,7 @@ struct History {
     replacements: Vec<Replacement>,
     refused: Vec<RefusedFrames>,
     late_frames: u64,
+    punctuality: Option<Punctuality>,
 }
 
 /// Refuses to spin with more processes than cores.
@@ -240,7 +264,7 @@ pub fn run_world(
     };
     // The desk last: once it exists, everything else does.
     let services =
-        Services::create(&space, scenario, (coordinators, controllers), options.replace).map_err(active)?;
+        Services::create(&space, scenario, (coordinators, controllers), options.keeps()).map_err(active)?;
     let _bells = create_bells(&space, wait, coordinators, controllers)?;
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
@@ -258,38 +282,54 @@ pub fn run_world(
     for Peer { role, index, process_id } in reception.peers().0 {
         driver.seat(role, index, Seat::new(0, process_id));
     }
-    let mut house = House { reception, replace: options.replace, gone: None, arrived: Vec::new() };
+    let mut house = House {
+        reception,
+        replace: options.replace,
+        pacer: Pacer::new(options.timing, scenario.dt_ns),
+        overdue: None,
+        gone: None,
+        arrived: Vec::new(),
+    };
     let mut history = History::default();
+    let is_paced = options.timing.pace == Pace::Realtime;
     let mut meter = StepMeter::start();
     let mut step = 0;
     loop {
+        if driver.is_between_steps() {
+            house.begin_step(&mut driver, &mut waiter, stop)?;
+            meter.begin_step(is_paced);
+        }
         match driver.advance().map_err(|error| waiter.explain(error))? {
             Progress::Finished => {
+                history.punctuality = house.pacer.report();
                 history.refused = driver.refused();
                 history.late_frames = driver.late_frames();
                 return Ok(meter.outcome(driver.world(), history));
             }
             Progress::Waiting(awaited) => house.wait(&mut driver, &mut waiter, awaited)?,
             Progress::Behind => unreachable!("the world is where the run is"),
-            Progress::Advanced => {
-                waiter.reset();
-                if driver.world().step() != step {
-                    step = driver.world().step();
-                    let ns = meter.step_done(driver.was_event());
-                    history.replacements.extend(house.step_done(ns));
-                    if step.is_multiple_of(STEPS_PER_LOOK) {
-                        progress(driver.world());
-                        house.attend(&mut driver, &mut waiter)?;
-                        if stop.is_set() {
-                            return Err(ProcessError::Interrupted { step: Some(step) });
-                        }
-                    }
-                }
+            Progress::Advanced => waiter.reset(),
+        }
+        if driver.world().step() == step {
+            continue;
+        }
+        step = driver.world().step();
+        waiter.reset();
+        house.overdue = None;
+        let ns = meter.step_done(driver.was_event());
+        history.replacements.extend(house.step_done(ns));
+        if is_paced || step.is_multiple_of(STEPS_PER_LOOK) {
+            progress(driver.world());
+            house.attend(&mut driver, &mut waiter)?;
+            if stop.is_set() {
+                return Err(ProcessError::Interrupted { step: Some(step) });
             }
         }
     }
 }
 
+/// Longest sleep between two looks at signals and newcomers while a step is not due.
+const LONGEST_SLEEP: Duration = Duration::from_millis(5);
 /// A participant that has sent a bad frame may take this long to send a good one.
 const SECOND_CHANCE: Duration = Duration::from_secs(1);
 /// Newcomers are seen to when a wait takes longer than this.
@@ -300,6 +340,9 @@ const ATTEND_AFTER: Duration = Duration::from_millis(1);
 struct House {
     reception: Reception,
     replace: bool,
+    pacer: Pacer,
+    /// The step's deadline has passed, and this is the verdict of what is put in for whoever is missing.
+    overdue: Option<u16>,
     /// Who has died last and was not replaced yet.
     gone: Option<Peer>,
     /// Who has come since the last step ended.
@@ -307,6 +350,35 @@ struct House {
 }
 
 impl House {
+    /// Waits until the present step is due.
+    fn begin_step<S, C, M, A>(
+        &mut self,
+        driver: &mut WorldDriver<S, C, M, A>,
+        waiter: &mut Waiter,
+        stop: &StopFlag,
+    ) -> Result<(), ProcessError>
+    where
+        S: Outbox<VehicleState>,
+        C: Outbox<VehicleState>,
+        M: Inbox<VehicleCommand>,
+        A: Inbox<Assignment>,
+    {
+        let step = driver.world().step();
+        while let Some(left) = self.pacer.until(step) {
+            if stop.is_set() {
+                return Err(ProcessError::Interrupted { step: Some(step) });
+            }
+            if left.is_zero() {
+                std::hint::spin_loop();
+            } else {
+                std::thread::sleep(left.min(LONGEST_SLEEP));
+                self.attend(driver, waiter)?;
+            }
+        }
+        self.pacer.begin(step);
+        Ok(())
+    }
+
     /// Waits a little; sees to newcomers when it takes long.
     fn wait<S, C, M, A>(
         &mut self,
@@ -320,6 +392,22 @@ impl House {
         M: Inbox<VehicleCommand>,
         A: Inbox<Assignment>,
     {
+        if self.pacer.has_missed(&awaited) {
+            match self.pacer.on_miss() {
+                OnMiss::Abort => return Err(ProcessError::DeadlineMissed { awaited }),
+                policy => self.overdue = policy.verdict(),
+            }
+        }
+        // While a coordinator is missing too, there is nothing the vehicles could go by.
+        if let Some(verdict) = self.overdue
+            && driver.put_in(verdict)?
+        {
+            self.overdue = None;
+            return Ok(());
+        }
+        if driver.expects_requests() {
+            self.attend(driver, waiter)?;
+        }
         if waiter.waited() >= ATTEND_AFTER {
             self.attend(driver, waiter)?;
             if waiter.waited() >= SECOND_CHANCE

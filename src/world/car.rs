@@ -1,7 +1,7 @@
 //! A vehicle as the world keeps it while it is in a zone or on a link.
 
 use crate::vehicle::Held;
-use ipc_schemas::NO_VEHICLE;
+use ipc_schemas::{NO_VEHICLE, VERDICT_NOMINAL};
 
 /// One vehicle in one place.
 #[derive(Clone, Copy, Debug)]
@@ -34,6 +34,8 @@ pub(super) struct Visit {
     /// What the shield holds the vehicle to.
     pub rear_end: Guard,
     pub merge: Guard,
+    /// Verdict of the command in force, a `frames::VERDICT_*`.
+    pub verdict: u16,
     /// Entered during the step just ended.
     pub entered: bool,
     pub infeasible: bool,
@@ -62,6 +64,7 @@ impl Visit {
         rear_end: Guard::NONE,
         merge: Guard::NONE,
         entered: true,
+        verdict: VERDICT_NOMINAL,
         infeasible: false,
         clean_rear_end: true,
         clean_merge: true,

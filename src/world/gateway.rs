@@ -13,6 +13,7 @@ use crate::scenario::{Drivers, Exit, Scenario, ShieldMode};
 use crate::shield::{Duty, Partner, RESERVE_M, Row, Shield};
 use crate::vehicle::Held;
 use ipc_schemas::{self as frames, VehicleCommand};
+use std::collections::HashMap;
 
 /// A command frame the world cannot take.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
@@ -114,6 +115,8 @@ pub(super) struct Gateway {
     rows: Vec<ShieldRow>,
     /// Motion over the step of each zone's members, in passing order; kept for its allocation.
     partners: Vec<Partner>,
+    /// Whether a command of this step is to be shielded whatever the mode.
+    falls_back: bool,
 }
 
 impl Gateway {
@@ -128,6 +131,7 @@ impl Gateway {
             rows: names.map(ShieldRow::new).collect(),
             drivers,
             partners: Vec::with_capacity(2),
+            falls_back: false,
         }
     }
 
@@ -154,11 +158,12 @@ impl World {
     /// limit, and both are counted; otherwise they are faults.
     ///
     /// # Errors
-    /// What is wrong with the first bad record. Part of the frame has then been taken.
+    /// What is wrong with the first bad record. The frame does not count then; another must come before the
+    /// step can be integrated.
     pub fn command(&mut self, sender: u32, commands: &[VehicleCommand]) -> Result<(), CommandFault> {
         let limits = self.scenario.vehicle;
-        let dt_s = self.scenario.dt_s();
-        let Gateway { mode, drivers, rows, .. } = &mut self.gateway;
+        let Gateway { mode, drivers, rows, falls_back, .. } = &mut self.gateway;
+        let (mut beyond, mut not_finite) = (0, 0);
         let mut next = 0;
         let mut fault = None;
         'zones: for zone in drivers.zones(sender) {
@@ -193,14 +198,13 @@ impl World {
                 let (min_mps2, max_mps2) = (limits.u_min_mps2, limits.u_max_mps2);
                 // Written so that NaN is no exception.
                 if !(u >= min_mps2 && u <= max_mps2) {
-                    let row = &mut rows[sender as usize];
                     match *mode {
                         ShieldMode::On if u.is_finite() => {
-                            row.limits += 1;
+                            beyond += 1;
                             u = u.clamp(min_mps2, max_mps2);
                         }
                         ShieldMode::On => {
-                            row.not_finite += 1;
+                            not_finite += 1;
                             u = min_mps2;
                         }
                         _ if u.is_finite() => {
@@ -215,21 +219,60 @@ impl World {
                 car.command_mps2 = u;
                 car.planned_exit_time_s = command.planned_exit_time_s;
                 car.planned_exit_speed_mps = command.planned_exit_speed_mps;
-                if command.verdict == frames::VERDICT_FE {
-                    car.visit.fe_s += dt_s;
-                }
-                car.visit.infeasible |= command.verdict == frames::VERDICT_INFEASIBLE;
+                car.visit.verdict = command.verdict;
+                *falls_back |= command.verdict == frames::VERDICT_FALLBACK;
                 next += 1;
             }
         }
-        self.commanded += next as u32;
+        if fault.is_none() && next == commands.len() {
+            let row = &mut rows[sender as usize];
+            row.limits += beyond;
+            row.not_finite += not_finite;
+            self.commanded += next as u32;
+            return Ok(());
+        }
         match fault {
             Some((record, vehicle, zone)) => {
                 Err(self.mismatch(sender, commands, record, Some((vehicle, zone))))
             }
-            None if next < commands.len() => Err(self.mismatch(sender, commands, next, None)),
-            None => Ok(()),
+            None => Err(self.mismatch(sender, commands, next, None)),
         }
+    }
+
+    /// What to command in place of a controller that has not answered, in the order of its frames: each
+    /// vehicle holds the acceleration it had, as far as the speed limits allow, and keeps what its controller
+    /// `remembered` of it in the step before. `verdict` says on which terms.
+    pub fn substitute(
+        &self,
+        controller: u32,
+        remembered: &[VehicleCommand],
+        verdict: u16,
+    ) -> Vec<VehicleCommand> {
+        let limits = &self.scenario.vehicle;
+        let dt_s = self.scenario.dt_s();
+        let memories: HashMap<(u32, u32), &VehicleCommand> =
+            remembered.iter().map(|c| ((c.zone, c.vehicle), c)).collect();
+        let drivers = &self.gateway.drivers;
+        let members = drivers
+            .zones(controller)
+            .flat_map(|zone| self.members(zone as usize).iter().map(move |car| (zone, car)));
+        members
+            .filter(|(zone, car)| drivers.of(*zone, car.path) == controller)
+            .map(|(zone, car)| {
+                let memory = memories.get(&(zone, car.vehicle)).map_or_else(VehicleCommand::default, |c| **c);
+                let fastest_mps2 = (limits.v_max_mps - car.v_mps) / dt_s;
+                // What it had is what the state frame says it did: a bad frame may have changed the command.
+                let held_mps2 = memories.get(&(zone, car.vehicle)).map_or(0.0, |_| car.u_mps2);
+                VehicleCommand {
+                    u_mps2: held_mps2.min(fastest_mps2).clamp(limits.u_min_mps2, limits.u_max_mps2),
+                    vehicle: car.vehicle,
+                    zone,
+                    binding_rows: 0,
+                    verdict,
+                    ..memory
+                }
+            })
+            .collect()
     }
 
     /// Forgets the commands taken for this step, so that all can be given again.
@@ -280,10 +323,11 @@ impl World {
             if self.sites[zone].has_left {
                 self.hold_left(scenario, zone);
             }
-            if self.gateway.mode != ShieldMode::Off {
+            if self.gateway.mode != ShieldMode::Off || self.gateway.falls_back {
                 self.shield_zone(zone);
             }
         }
+        self.gateway.falls_back = false;
     }
 
     /// Index 0 moves with the vehicle it stands for.
@@ -319,11 +363,15 @@ impl World {
     /// Projects the commands of a zone's members, in passing order.
     fn shield_zone(&mut self, zone: usize) {
         let lengths_m = &self.lengths_m[zone];
-        let Gateway { mode, shield, drivers, rows, partners } = &mut self.gateway;
+        let Gateway { mode, shield, drivers, rows, partners, .. } = &mut self.gateway;
         let cars = &mut self.cars[zone];
         for i in self.sites[zone].first()..cars.len() {
             let (before, rest) = cars.split_at_mut(i);
             let car = &mut rest[0];
+            let falls_back = car.visit.verdict == frames::VERDICT_FALLBACK;
+            if *mode == ShieldMode::Off && !falls_back {
+                continue;
+            }
             // The partners of `coordination::partners`, from the same order.
             let ahead = before.iter().rev().find(|c| c.path == car.path);
             let previous = before.last().filter(|c| c.path != car.path);
@@ -355,7 +403,7 @@ impl World {
                 Some(Row::RearEnd) => row.rear_end += 1,
                 Some(Row::Merge) => row.merge += 1,
             }
-            if *mode == ShieldMode::On {
+            if *mode == ShieldMode::On || falls_back {
                 car.command_mps2 = found.u_mps2;
             }
             let held = car.held();

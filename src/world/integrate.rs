@@ -7,6 +7,7 @@ use super::metrics::CompletedVisit;
 use super::role::World;
 use crate::scenario::{Exit, Scenario, ZoneId};
 use crate::vehicle::{Held, Merge, Pair, RearEnd, satisfiable_at};
+use ipc_schemas::{VERDICT_FE, VERDICT_INFEASIBLE};
 
 /// A vehicle about to enter a zone at the end of the step.
 #[derive(Clone, Copy, Debug)]
@@ -79,6 +80,11 @@ impl World {
         for i in self.sites[zone].first()..cars.len() {
             let (before, rest) = cars.split_at_mut(i);
             let (car, held) = (&mut rest[0], &motions[i]);
+            match car.visit.verdict {
+                VERDICT_FE => car.visit.fe_s += dt_s,
+                VERDICT_INFEASIBLE => car.visit.infeasible = true,
+                _ => {}
+            }
             let ahead_at = before.iter().rposition(|c| c.path == car.path);
             if car.visit.entered {
                 let previous = before.last().filter(|c| c.path != car.path);

@@ -1,0 +1,223 @@
+//! Steps at their instants, and what becomes of those that are not done in time.
+
+use super::{Percentiles, new_histogram};
+use crate::lockstep::Awaited;
+use hdrhistogram::Histogram;
+use ipc_schemas::{Role, VERDICT_FALLBACK, VERDICT_HELD};
+use serde::{Deserialize, Serialize};
+use std::time::{Duration, Instant};
+
+/// When steps begin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum)]
+pub enum Pace {
+    /// Each as soon as the one before is done.
+    #[default]
+    Free,
+    /// Step k at k times the step length after the first.
+    Realtime,
+}
+
+/// What the world does about a controller that has not answered by the deadline.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OnMiss {
+    /// It waits, and makes up for lost time afterwards.
+    #[default]
+    Wait,
+    /// It goes on; the vehicles hold their accelerations.
+    Hold,
+    /// It goes on; the vehicles hold their accelerations as far as the shield allows.
+    ShieldFallback,
+    /// It ends the run.
+    Abort,
+}
+
+impl OnMiss {
+    /// The verdict of commands put in, where the world goes on.
+    pub(super) fn verdict(self) -> Option<u16> {
+        match self {
+            OnMiss::Wait | OnMiss::Abort => None,
+            OnMiss::Hold => Some(VERDICT_HELD),
+            OnMiss::ShieldFallback => Some(VERDICT_FALLBACK),
+        }
+    }
+}
+
+/// When steps begin, by when they are to be done, and what happens otherwise.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Timing {
+    /// When steps begin.
+    pub pace: Pace,
+    /// Time from a step's beginning to its deadline; by default the step length when paced, and none
+    /// otherwise.
+    pub deadline: Option<Duration>,
+    /// What happens when a deadline is missed.
+    pub on_miss: OnMiss,
+}
+
+/// How punctual a run was.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Punctuality {
+    /// Whether steps began at scheduled instants.
+    pub paced: bool,
+    /// From a step's beginning to its deadline, us.
+    pub deadline_us: f64,
+    /// What happened when a deadline was missed.
+    pub on_miss: OnMiss,
+    /// Steps that were not done by their deadlines.
+    pub missed_steps: u64,
+    /// Of these, steps that only began after their deadlines, because those before them took too long.
+    pub began_late: u64,
+    /// Who had not answered by then, and in how many steps.
+    pub missed_by: Vec<MissedBy>,
+    /// How long after its scheduled instant each step's state was published, ns; all 0 in a free run.
+    pub lateness_ns: Percentiles,
+}
+
+/// The missed deadlines of one participant.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MissedBy {
+    /// Role and index.
+    pub participant: String,
+    /// Steps.
+    pub steps: u64,
+}
+
+/// Keeps a run's schedule.
+#[derive(Debug)]
+pub(super) struct Pacer {
+    timing: Timing,
+    step_length: Duration,
+    /// Scheduled beginning of the first step, and its number.
+    origin: Option<(Instant, u64)>,
+    deadline: Option<Instant>,
+    missed_steps: u64,
+    missed_by: Vec<(Role, u32, u64)>,
+    /// Missed steps that began after their deadlines.
+    backlog: u64,
+    lateness_ns: Histogram<u64>,
+}
+
+/// The last stretch before an instant is spent polling the clock: a sleep may take this much longer.
+const LAST_STRETCH: Duration = Duration::from_micros(200);
+
+impl Pacer {
+    pub fn new(timing: Timing, dt_ns: u64) -> Pacer {
+        Pacer {
+            timing,
+            step_length: Duration::from_nanos(dt_ns),
+            origin: None,
+            deadline: None,
+            missed_steps: 0,
+            missed_by: Vec::new(),
+            backlog: 0,
+            lateness_ns: new_histogram(),
+        }
+    }
+
+    /// What happens when a deadline is missed.
+    pub fn on_miss(&self) -> OnMiss {
+        self.timing.on_miss
+    }
+
+    /// How long until a step is due, if it is not yet: sleep at most half of it, or, when it is short, ask
+    /// again at once.
+    pub fn until(&mut self, step: u64) -> Option<Duration> {
+        if self.timing.pace == Pace::Free {
+            return None;
+        }
+        let due = self.due(step);
+        let left = due.saturating_duration_since(Instant::now());
+        (!left.is_zero()).then(|| left.saturating_sub(LAST_STRETCH))
+    }
+
+    fn due(&mut self, step: u64) -> Instant {
+        let (start, first) = *self.origin.get_or_insert_with(|| (Instant::now(), step));
+        let steps = step - first;
+        start + Duration::from_nanos(self.step_length.as_nanos() as u64 * steps)
+    }
+
+    /// A step begins now.
+    pub fn begin(&mut self, step: u64) {
+        if self.timing.pace == Pace::Free && self.timing.deadline.is_none() {
+            return;
+        }
+        let now = Instant::now();
+        let start = if self.timing.pace == Pace::Free { now } else { self.due(step) };
+        // Only an absurd lateness could not be recorded.
+        let _ = self.lateness_ns.record(now.saturating_duration_since(start).as_nanos() as u64);
+        let deadline = start + self.timing.deadline.unwrap_or(self.step_length);
+        if now < deadline {
+            self.deadline = Some(deadline);
+        } else {
+            // Whoever held up the steps before has been counted there.
+            self.deadline = None;
+            self.missed_steps += 1;
+            self.backlog += 1;
+        }
+    }
+
+    /// Whether the present step's deadline has just passed; true once per step.
+    pub fn has_missed(&mut self, awaited: &Awaited) -> bool {
+        if self.deadline.is_none_or(|deadline| Instant::now() < deadline) {
+            return false;
+        }
+        self.deadline = None;
+        self.missed_steps += 1;
+        for index in (0..64).filter(|i| awaited.missing >> i & 1 == 1) {
+            match self.missed_by.iter_mut().find(|(role, i, _)| (*role, *i) == (awaited.role, index)) {
+                Some((.., steps)) => *steps += 1,
+                None => self.missed_by.push((awaited.role, index, 1)),
+            }
+        }
+        true
+    }
+
+    /// How punctual the run was; `None` where nothing was asked for.
+    pub fn report(&self) -> Option<Punctuality> {
+        if self.timing.pace == Pace::Free && self.timing.deadline.is_none() {
+            return None;
+        }
+        Some(Punctuality {
+            paced: self.timing.pace == Pace::Realtime,
+            deadline_us: self.timing.deadline.unwrap_or(self.step_length).as_secs_f64() * 1e6,
+            on_miss: self.timing.on_miss,
+            missed_steps: self.missed_steps,
+            began_late: self.backlog,
+            missed_by: self
+                .missed_by
+                .iter()
+                .map(|(role, index, steps)| MissedBy {
+                    participant: format!("{role} {index}"),
+                    steps: *steps,
+                })
+                .collect(),
+            lateness_ns: Percentiles::of(&self.lateness_ns),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn instants_are_absolute_and_misses_are_counted_once_per_step_and_participant() {
+        let timing = Timing { pace: Pace::Realtime, deadline: None, on_miss: OnMiss::Wait };
+        let mut pacer = Pacer::new(timing, 1_000_000);
+        let awaited = Awaited { role: Role::Controller, missing: 0b101, what: "commands", step: 0 };
+        assert_eq!(pacer.until(7), None, "the first step is due at once");
+        let origin = pacer.due(7);
+        pacer.begin(7);
+        while !pacer.has_missed(&awaited) {}
+        assert!(Instant::now() >= origin + Duration::from_millis(1));
+        assert!(!pacer.has_missed(&awaited));
+        // Twenty steps on, the schedule is where it would have been without the miss.
+        assert_eq!(pacer.due(27), origin + Duration::from_millis(20));
+        pacer.begin(8);
+        while !pacer.has_missed(&Awaited { missing: 0b100, ..awaited }) {}
+        let report = pacer.report().expect("there was a schedule");
+        let by = |i: usize| (report.missed_by[i].participant.as_str(), report.missed_by[i].steps);
+        assert_eq!((report.missed_steps, by(0), by(1)), (2, ("controller 0", 1), ("controller 2", 2)));
+    }
+}
