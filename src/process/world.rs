@@ -1,6 +1,7 @@
 //! The world process.
 
 use super::attach::Reception;
+use super::placement::number_of_cores;
 use super::{Patience, ProcessError, Settled, StopFlag, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Progress, WorldDriver, WorldPorts};
@@ -176,7 +177,7 @@ impl StepMeter {
 
 /// Refuses to spin with more processes than cores.
 pub fn check_cores(processes: usize) -> Result<(), ProcessError> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let cores = number_of_cores();
     if processes > cores { Err(ProcessError::TooFewCores { processes, cores }) } else { Ok(()) }
 }
 
