@@ -43,6 +43,8 @@ pub(super) enum Command {
     Reproduce(ReproduceArgs),
     /// Measure latency, the solver, or scale on this machine.
     Bench(BenchArgs),
+    /// Remove the shared memory and files that crashed runs of yours have left; active runs are not touched.
+    Clean(CleanArgs),
     /// Controllers of your own: check one against the contract, or numbers against the law.
     Plugin {
         #[command(subcommand)]
@@ -53,6 +55,13 @@ pub(super) enum Command {
         #[command(subcommand)]
         command: SdkCommand,
     },
+}
+
+#[derive(Debug, Args)]
+pub(super) struct CleanArgs {
+    /// Only say what would be removed.
+    #[arg(long)]
+    pub dry_run: bool,
 }
 
 #[derive(Debug, Args)]

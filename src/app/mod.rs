@@ -2,6 +2,7 @@
 
 mod args;
 mod bench;
+mod clean;
 mod controllers;
 mod golden;
 mod parts;
@@ -89,6 +90,7 @@ pub fn cz() -> ExitCode {
             args::Command::Verify(args) => record::verify(&args),
             args::Command::Replay(args) => record::replay(&args),
             args::Command::Reproduce(args) => reproduce::cli::main(&args).map_err(AppError::from),
+            args::Command::Clean(args) => clean::clean(&args),
             args::Command::Bench(args) => bench::bench(&args),
             args::Command::Plugin { command } => plugin::plugin(&command),
             args::Command::Sdk { command } => sdk::sdk(&command),

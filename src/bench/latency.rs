@@ -233,7 +233,11 @@ fn socket_step(
     let (stream, _peer) = match kind {
         SocketKind::Unix => {
             let path = std::env::temp_dir().join(format!("cz-bench-{}.sock", std::process::id()));
-            let listener = UnixListener::bind(&path).map_err(io("bind a unix socket"))?;
+            // The socket is this user's from the first moment.
+            let before = rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o077));
+            let listener = UnixListener::bind(&path).map_err(io("bind a unix socket"));
+            rustix::process::umask(before);
+            let listener = listener?;
             let peer = start(options, affinity, &["unix", &path.to_string_lossy()]);
             let accepted = peer.and_then(|peer| {
                 let (stream, _) = listener.accept().map_err(io("accept"))?;

@@ -2,6 +2,7 @@
 
 use super::{BenchError, io};
 use memmap2::MmapMut;
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -25,6 +26,7 @@ impl SharedWords {
             .write(true)
             .create(true)
             .truncate(false)
+            .mode(0o600)
             .open(path)
             .map_err(io("open the shared word"))?;
         file.set_len(4096).map_err(io("size the shared word"))?;

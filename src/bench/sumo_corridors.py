@@ -8,6 +8,7 @@ import importlib.metadata
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -99,7 +100,10 @@ def run(path, step_s, until_s):
 
 def measure(vehicles, step_s, from_s, until_s, repeats):
     corridors = max(1, math.ceil(vehicles / VEHICLES_PER_CORRIDOR))
-    with tempfile.TemporaryDirectory(prefix="cz-sumo-") as directory:
+    # The process id in the name lets `cz clean` tell what a killed measurement has left.
+    directory = os.path.join(tempfile.gettempdir(), f"cz-sumo-{os.getpid()}")
+    os.mkdir(directory, 0o700)
+    try:
         path = os.path.join(directory, "corridors")
         network(path, corridors)
         demand(path, corridors, until_s)
@@ -107,6 +111,8 @@ def measure(vehicles, step_s, from_s, until_s, repeats):
         for _ in range(repeats):
             shorter.append(run(path, step_s, from_s))
             longer.append(run(path, step_s, until_s))
+    finally:
+        shutil.rmtree(directory)
     # The same seed steps the same way, so only the time differs from run to run; the least counts, as
     # interruptions only ever add.
     (short_s, short_steps), (long_s, long_steps) = min(shorter), min(longer)

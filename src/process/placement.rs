@@ -2,6 +2,7 @@
 
 use ipc_schemas::Role;
 use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use std::sync::OnceLock;
 
 /// Where processes go.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum)]
@@ -42,6 +43,7 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     if placement == Placement::None {
         return None;
     }
+    number_of_cores();
     let cores = cores();
     let core = match (role, &cores[..]) {
         (_, []) => return None,
@@ -52,6 +54,13 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     set.set(core);
     sched_setaffinity(None, &set).ok()?;
     Some(core)
+}
+
+/// Number of cores this process had to choose from before it was placed on one of them. That is how many the
+/// processes of a run have among them.
+pub(super) fn number_of_cores() -> usize {
+    static CORES: OnceLock<usize> = OnceLock::new();
+    *CORES.get_or_init(|| std::thread::available_parallelism().map_or(1, usize::from))
 }
 
 /// The cores the calling thread may use.

@@ -5,6 +5,7 @@
 //! yield otherwise, and now and then in any case ([`Breather`]); and a limit on the time between two sleeps
 //! ends it should it never sleep again.
 
+use super::placement::{cores, number_of_cores};
 use super::{Placement, WaitMode, place};
 use ipc_schemas::Role;
 use rustix::mm::{MlockAllFlags, mlockall};
@@ -75,20 +76,16 @@ impl Settling<'_> {
             Some(why) => format!("{} ({why})", scheduling()),
             None => scheduling(),
         };
-        let cores = super::placement::cores();
+        let cores = cores();
         (self.report)(&Settled { process, cores, scheduling, memory_locked, memory_note });
     }
 }
 
 /// Under SCHED_FIFO from here on, or why not.
 fn ask_for_fifo(role: Role, wait: WaitMode, hot_processes: usize) -> Result<(), String> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let busy = match wait {
-        WaitMode::Block => false,
-        WaitMode::Hybrid => role != Role::Coordinator,
-        WaitMode::Spin => true,
-    };
-    if busy && hot_processes > cores {
+    let cores = number_of_cores();
+    // All or none: a coordinator that none may interrupt could wait for one that does not get to run.
+    if wait != WaitMode::Block && hot_processes > cores {
         return Err(format!(
             "SCHED_FIFO not asked for: {hot_processes} processes wait busily and there are {cores} cores"
         ));

@@ -1,5 +1,6 @@
 //! How a process waits for a frame: busily at first, then asleep, never for ever.
 
+use super::placement::number_of_cores;
 use super::realtime::Breather;
 use super::{Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
@@ -80,7 +81,7 @@ const BELL_NAP: Duration = Duration::from_millis(20);
 impl Patience {
     /// What suits a role under a mode in a run with that many hot processes (world and controllers).
     pub fn of(mode: WaitMode, role: Role, hot_processes: usize, timeout: Duration) -> Patience {
-        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let cores = number_of_cores();
         let sleeper = Patience { spin: Duration::ZERO, busy: Duration::ZERO, nap: BELL_NAP, timeout };
         match mode {
             WaitMode::Block => sleeper,
@@ -92,6 +93,13 @@ impl Patience {
             WaitMode::Hybrid => Patience { spin: SPIN, busy: BUSY, nap: NAP, timeout },
             WaitMode::Spin => Patience { spin: Duration::MAX, busy: Duration::MAX, nap: NAP, timeout },
         }
+    }
+}
+
+impl Patience {
+    /// Whether spinning is followed by yielding: neither where it never ends nor under SCHED_FIFO.
+    fn yields(&self) -> bool {
+        self.spin < self.busy
     }
 }
 
@@ -164,7 +172,9 @@ impl Waiter {
         if !busy || self.polls.is_multiple_of(POLLS_PER_LOOK) {
             self.look(awaited)?;
         }
-        if self.waited < self.patience.spin {
+        // A coordinator has just been woken, likely on this core: spinning would only keep it from it.
+        let give_way = awaited.role == Role::Coordinator && self.patience.yields();
+        if self.waited < self.patience.spin && !give_way {
             std::hint::spin_loop();
         } else if busy {
             std::thread::yield_now();

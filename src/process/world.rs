@@ -2,6 +2,7 @@
 
 use super::attach::{Readiness, Reception};
 use super::pace::Pacer;
+use super::placement::number_of_cores;
 use super::{
     OnMiss, Pace, Patience, Peer, Peers, ProcessError, Punctuality, Settled, StopFlag, Timing, WaitMode,
     Waiter,
@@ -237,7 +238,7 @@ struct History {
 
 /// Refuses to spin with more processes than cores.
 pub fn check_cores(processes: usize) -> Result<(), ProcessError> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let cores = number_of_cores();
     if processes > cores { Err(ProcessError::TooFewCores { processes, cores }) } else { Ok(()) }
 }
 

@@ -79,6 +79,11 @@ impl Site {
         self.start("cz", &all).ended().json()
     }
 
+    /// The directory of all runs of the site.
+    pub fn runs(&self) -> PathBuf {
+        self.runtime.path().join("cz")
+    }
+
     /// Files of the site's run, in the runtime directory and in shared memory.
     pub fn files(&self) -> Vec<PathBuf> {
         files(Some(self.runtime.path()), &self.run)

@@ -1,10 +1,12 @@
 //! Frames between processes: iceoryx2 publish/subscribe over shared memory.
 
 mod bell;
+mod leftovers;
 mod ports;
 mod space;
 
 pub use bell::{Bell, BellRope, BellService};
+pub use leftovers::{Condition, Leftover, clean};
 pub use ports::{IoxFrame, IoxInbox, IoxLoan, IoxOutbox};
 pub use space::{
     AttachDesk, AttachLine, ReplyFrame, RunName, RunNameError, RunSpace, Service, ServiceLimits, SpaceError,

@@ -162,6 +162,7 @@ impl RunSpace {
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
             .map_err(|e| failed("create a node", &e))?;
+        close_to_others(&prefix(run, &directory));
         node.try_cleanup_dead_nodes();
         Ok(RunSpace { node: Some(node), config, run: run.clone(), directory })
     }
@@ -333,16 +334,30 @@ fn remove_base(directory: &Path) {
     }
 }
 
+/// Takes from other users what iceoryx2 lets them have: it creates one file per prefix, a counter of nodes,
+/// for everybody to write. All others it creates for this user alone.
+fn close_to_others(prefix: &str) {
+    use std::os::unix::fs::PermissionsExt;
+    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
+        let name = entry.file_name();
+        let name = name.to_string_lossy();
+        if name.starts_with(prefix) && name.ends_with(".global_mgmt") {
+            // It belongs to this user, or is gone already with the last process of a former run.
+            let _ = std::fs::set_permissions(entry.path(), std::fs::Permissions::from_mode(0o600));
+        }
+    }
+}
+
 /// File-name prefix of a run's shared memory. The directory's hash in it keeps apart runs of one name in
 /// different runtime directories, which do not see each other's nodes and would otherwise sweep each
 /// other's memory; the fixed length of the hash keeps a run `a` from matching the files of a run `a-b`.
-fn prefix(run: &RunName, directory: &Path) -> String {
+pub(super) fn prefix(run: &RunName, directory: &Path) -> String {
     let place = crc32fast::hash(directory.as_os_str().as_encoded_bytes());
     format!("cz_{}_{run}_{place:08x}_", rustix::process::getuid().as_raw())
 }
 
 /// The directory under which each run has its own: in the user's runtime directory where there is one.
-fn base_directory() -> PathBuf {
+pub(super) fn base_directory() -> PathBuf {
     match std::env::var_os("XDG_RUNTIME_DIR") {
         Some(runtime) if Path::new(&runtime).is_dir() => PathBuf::from(runtime).join("cz"),
         _ => std::env::temp_dir().join(format!("cz-{}", rustix::process::getuid().as_raw())),
@@ -364,7 +379,7 @@ fn private_directory(path: &Path) -> Result<(), SpaceError> {
     }
 }
 
-fn config(run: &RunName, directory: &Path) -> Result<Config, SpaceError> {
+pub(super) fn config(run: &RunName, directory: &Path) -> Result<Config, SpaceError> {
     let mut config = Config::default();
     let path = directory.to_string_lossy();
     let path = iceoryx2::prelude::Path::new(path.as_bytes())
