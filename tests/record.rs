@@ -358,6 +358,18 @@ fn exchanged_and_forged_steps_are_noticed() {
     assert_eq!(reader.steps().filter_map(Result::err).map(|d| d.flaw).next(), Some(Flaw::Chain));
 }
 
+#[test]
+fn a_tail_that_points_beyond_the_file_is_damage() {
+    let run = small();
+    let mut bytes = run.bytes.clone();
+    let tail = bytes.len() - 24;
+    bytes[tail + 8..tail + 16].copy_from_slice(&(1_u64 << 40).to_le_bytes());
+    let check = xxhash_rust::xxh3::xxh3_64(&bytes[tail..tail + 16]);
+    bytes[tail + 16..].copy_from_slice(&check.to_le_bytes());
+    let (steps, flaws) = honest(&run, &bytes, "tail beyond the end").unwrap();
+    assert_eq!((steps, &flaws[..]), (run.steps.len() as u64, &[Flaw::End][..]));
+}
+
 /// An output that writes nothing until it is let.
 #[derive(Clone, Default)]
 struct Gated(Arc<Gate>);
