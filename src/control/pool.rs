@@ -102,7 +102,8 @@ pub enum PoolError {
         /// The vehicle.
         vehicle: u32,
     },
-    /// An assignment has a kind no constraint has, or distances that are not positive numbers.
+    /// An assignment has a kind no constraint has, distances that are not positive numbers, or a terminal
+    /// speed no vehicle may have.
     #[error("an assignment of vehicle {vehicle} in zone {zone} is malformed")]
     Malformed {
         /// The zone.
@@ -157,7 +158,8 @@ impl ControllerPool {
                 drift = from.wrapping_sub(self.starts[lane]);
                 let slice = states[from..].chunk_by(|a, b| a.zone == b.zone).next().unwrap_or(&[]);
                 let slice = if slice.first().is_some_and(|s| s.zone == zone) { slice } else { &[] };
-                self.crew.assign(zone, slice, group, &self.members[lane])?;
+                let v_max_mps = self.scenario.vehicle.v_max_mps;
+                self.crew.assign(zone, slice, group, &self.members[lane], v_max_mps)?;
                 self.members.set(lane, &self.crew.members);
                 self.constraints.set(lane, &self.crew.constraints);
             }
@@ -318,6 +320,7 @@ impl Crew {
         slice: &[VehicleState],
         assignments: &[Assignment],
         before: &[Member],
+        v_max_mps: f64,
     ) -> Result<(), PoolError> {
         self.members.clear();
         self.constraints.clear();
@@ -339,7 +342,7 @@ impl Crew {
             };
             let first = self.constraints.len() as u32;
             for assignment in group {
-                if let Some(constraint) = resolve(slice, assignment)? {
+                if let Some(constraint) = resolve(slice, assignment, v_max_mps)? {
                     self.constraints.push(constraint);
                 }
             }
@@ -363,22 +366,26 @@ impl Crew {
     }
 }
 
+/// No approach is longer than this, m.
+const MAX_CONFLICT_M: f64 = 1e9;
+
 /// Turns an assignment into a place in the zone's slice; `None` for one without partner.
-fn resolve(slice: &[VehicleState], a: &Assignment) -> Result<Option<Constraint>, PoolError> {
+fn resolve(slice: &[VehicleState], a: &Assignment, v_max_mps: f64) -> Result<Option<Constraint>, PoolError> {
     let malformed = PoolError::Malformed { zone: a.zone, vehicle: a.vehicle };
+    let is_distance = |m: f64| m > 0.0 && m <= MAX_CONFLICT_M;
+    // The law plans with the terminal speed of any of them.
+    let sound = is_distance(a.own_conflict_m)
+        && is_distance(a.partner_conflict_m)
+        && (0.0..=v_max_mps).contains(&a.terminal_speed_mps);
+    if !sound {
+        return Err(malformed);
+    }
     let kind = match a.kind {
         frames::CONSTRAINT_NONE => return Ok(None),
         frames::CONSTRAINT_REAR_END => PartnerKind::RearEnd,
         frames::CONSTRAINT_MERGE => PartnerKind::Merge,
         _ => return Err(malformed),
     };
-    let sound = a.own_conflict_m > 0.0
-        && a.own_conflict_m.is_finite()
-        && a.partner_conflict_m.is_finite()
-        && a.terminal_speed_mps.is_finite();
-    if !sound {
-        return Err(malformed);
-    }
     let partner_at = slice
         .iter()
         .position(|s| s.vehicle == a.partner)
@@ -443,4 +450,37 @@ fn memory(command: &VehicleCommand) -> Memory {
         },
     });
     Memory { mode: if command.mode == frames::MODE_OCBF { Mode::Ocbf } else { Mode::Fe }, plan }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::scenario::load_embedded;
+
+    #[test]
+    fn assignments_the_law_could_not_plan_with_are_refused() {
+        let scenario = Arc::new(load_embedded("two-merges", &[], None).unwrap());
+        let v_max_mps = scenario.vehicle.v_max_mps;
+        let states = [VehicleState { v_mps: 15.0, entry_speed_mps: 15.0, ..VehicleState::default() }];
+        let good = Assignment {
+            own_conflict_m: 200.0,
+            partner_conflict_m: 200.0,
+            terminal_speed_mps: 15.0,
+            partner: frames::NO_VEHICLE,
+            ..Assignment::default()
+        };
+        let judge = |assignment: Assignment| {
+            ControllerPool::new(scenario.clone(), 0..2).coordinate(&states, &[assignment])
+        };
+        assert_eq!(judge(good), Ok(()));
+        for speed in [f64::NAN, f64::INFINITY, -1.0, v_max_mps * 1.01] {
+            let refused = judge(Assignment { terminal_speed_mps: speed, ..good });
+            assert_eq!(refused, Err(PoolError::Malformed { zone: 0, vehicle: 0 }), "{speed}");
+        }
+        for m in [f64::NAN, 0.0, -200.0, 1e300] {
+            assert!(judge(Assignment { own_conflict_m: m, ..good }).is_err(), "{m}");
+            assert!(judge(Assignment { partner_conflict_m: m, ..good }).is_err(), "{m}");
+        }
+    }
 }

@@ -123,6 +123,12 @@ impl BlockHead {
         Ok(head)
     }
 
+    /// Sets length and checksum to what the other fields ask for.
+    pub fn seal(&mut self) {
+        self.length = self.length_by_counts();
+        self.check = self.checksum();
+    }
+
     fn checksum(&self) -> u64 {
         xxh3_64(&self.as_bytes()[..HEAD - size_of::<u64>()])
     }
@@ -155,8 +161,7 @@ impl StepFrames<'_> {
             reserved: 0,
             check: 0,
         };
-        head.length = head.length_by_counts();
-        head.check = head.checksum();
+        head.seal();
         head
     }
 

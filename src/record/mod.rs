@@ -9,6 +9,8 @@ mod format;
 mod reader;
 mod recorder;
 mod replay;
+#[cfg(fuzzing)]
+mod reseal;
 mod writer;
 
 pub use block::{BlockFault, CommandPart, Commands, POLICY_NONE, Step, StepFrames};
@@ -17,4 +19,6 @@ pub use format::{Build, Footer, Metadata, Processes, RunEnd, ScenarioSource};
 pub use reader::{Damage, FileSource, Flaw, OpenError, Reader, Source, Steps};
 pub use recorder::{Output, QueueLimits, RecordError, Recorded, Recorder, steps_in};
 pub use replay::{Replay, ReplayError, RoleReport, Stop, replay, replay_world};
+#[cfg(fuzzing)]
+pub use reseal::reseal;
 pub use writer::{WriteError, Writer};

@@ -347,7 +347,7 @@ impl<S: Source> Reader<S> {
     fn end_length(&self, at: u64) -> io::Result<Option<u64>> {
         let head = fixed::<EndHead, S>(&self.source, at)?;
         let head = head.filter(|head| head.magic == END_MAGIC && head.check == head.checksum());
-        let left = self.source.length() - at;
+        let left = self.source.length().saturating_sub(at);
         Ok(head.and_then(|head| head.section()).filter(|length| *length <= left))
     }
 
