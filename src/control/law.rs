@@ -6,6 +6,7 @@ use super::rows::{Interval, Row, Rows};
 use super::{clarabel, reference};
 use crate::scenario::{FeConditions, Replan, SafetyRows, Scenario, Solver};
 use crate::vehicle::{Inequality, Merge, Pair, RearEnd, satisfiable_at};
+use std::hint::select_unpredictable;
 
 /// What the partner is to the vehicle.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -139,6 +140,7 @@ impl Law {
     }
 
     /// Decides one vehicle's command and updates its memory.
+    #[inline]
     pub fn decide<P>(&self, s: &Situation, partners: P, memory: &mut Memory) -> Decision
     where
         P: Iterator<Item = Partner> + Clone,
@@ -158,19 +160,17 @@ impl Law {
             None => Decision { u_mps2: self.vehicle.u_min_mps2, verdict: Verdict::Infeasible },
             Some(u) => {
                 let wish = tracking.free_minimum_mps2();
-                let verdict = if wish > interval.high {
-                    Verdict::Bound(interval.high_row)
-                } else if wish < interval.low {
-                    Verdict::Bound(interval.low_row)
-                } else {
-                    Verdict::Nominal
-                };
+                let (above, below) = (wish > interval.high, wish < interval.low);
+                let row = select_unpredictable(above, interval.high_row, interval.low_row);
+                let verdict =
+                    select_unpredictable(above || below, Verdict::Bound(row), Verdict::Nominal);
                 Decision { u_mps2: u, verdict }
             }
         }
     }
 
     /// The program of `equ:ocbf_qp` for this step; `None` in FE mode, which does not solve one.
+    #[inline]
     pub fn program<P>(&self, s: &Situation, partners: P, memory: &mut Memory) -> Option<Program>
     where
         P: Iterator<Item = Partner> + Clone,
@@ -209,15 +209,13 @@ impl Law {
     }
 
     /// The plan in force: made when there is none, re-made when the terminal condition changed.
-    fn plan(&self, s: &Situation, memory: &mut Memory) -> Reference {
+    #[inline]
+    fn plan<'m>(&self, s: &Situation, memory: &'m mut Memory) -> &'m Reference {
         match memory.plan {
-            Some(plan) if plan.terminal == s.terminal => plan,
-            old => {
-                let plan = self.new_plan(s, old);
-                memory.plan = Some(plan);
-                plan
-            }
+            Some(plan) if plan.terminal == s.terminal => {}
+            old => memory.plan = Some(self.new_plan(s, old)),
         }
+        memory.plan.as_ref().expect("there was a plan, or one has just been made")
     }
 
     /// Plans from the entry or from the present state (`replan` in the scenario).
@@ -259,6 +257,7 @@ impl Law {
     }
 
     /// Adds all rows but the acceleration limits.
+    #[inline]
     fn rows<P, R>(&self, s: &Situation, partners: P, rows: &mut R)
     where
         P: Iterator<Item = Partner>,

@@ -3,7 +3,7 @@
 use super::law::{Law, Memory, Mode, Partner, PartnerKind, Program, Situation, Verdict};
 use super::reference::{Optimum, Reference, Terminal};
 use super::rows::Row;
-use crate::lanes::Lanes;
+use crate::lanes::{AHEAD, Lanes, fetch};
 use crate::scenario::{Scenario, ZoneId};
 use crate::vehicle::Inequality;
 use ipc_schemas::{self as frames, Assignment, VehicleCommand, VehicleState};
@@ -45,6 +45,9 @@ struct Member {
     first_constraint: u32,
     end_constraint: u32,
 }
+
+/// About as many records as [`AHEAD`] zones have.
+const RECORDS_AHEAD: usize = 16;
 
 /// An assignment, resolved to a place in the zone's slice of the state frame. The slice keeps its
 /// shape until the zone's next event, and with that event come new assignments.
@@ -236,12 +239,16 @@ impl ControllerPool {
         mut with: impl FnMut(&Law, &VehicleState, &Situation, Partners<'_>, &mut Memory),
     ) -> Result<(), PoolError> {
         let range = self.own_range(states);
-        let mut start = range.start;
+        let (mut start, end) = (range.start, range.end);
         for slice in states[range].chunk_by(|a, b| a.zone == b.zone) {
             let zone = slice[0].zone;
             let lane = (zone - self.zones.start) as usize;
             self.starts[lane] = start;
             start += slice.len();
+            let ahead = (start + RECORDS_AHEAD).min(end);
+            fetch(&states[ahead..(ahead + slice.len()).min(end)]);
+            self.members.fetch(lane + AHEAD);
+            self.constraints.fetch(lane + AHEAD);
             let present = &slice[usize::from(slice[0].flags & frames::STATE_LEFT != 0)..];
             if present.is_empty() {
                 continue;

@@ -7,6 +7,7 @@
 //! on the interval is the nearest point of the interval.
 
 use super::rows::Interval;
+use std::hint::select_unpredictable;
 
 /// The tracking part of the program.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -23,14 +24,14 @@ pub struct Tracking {
 
 impl Tracking {
     /// The minimiser without bounds on u.
+    #[inline]
     pub fn free_minimum_mps2(&self) -> f64 {
         let y = self.error_mps;
         let row = 2.0 * y * self.u_ref_mps2 + self.clf_rate_per_s * y * y;
-        if row <= 0.0 || self.slack_weight == 0.0 {
-            return self.u_ref_mps2;
-        }
         let w = self.slack_weight;
-        (self.u_ref_mps2 - 4.0 * w * self.clf_rate_per_s * y * y * y) / (1.0 + 8.0 * w * y * y)
+        let tracked = (self.u_ref_mps2 - 4.0 * w * self.clf_rate_per_s * y * y * y) / (1.0 + 8.0 * w * y * y);
+        // Either is the case for every other vehicle: no branch could be foretold.
+        select_unpredictable(row <= 0.0 || w == 0.0, self.u_ref_mps2, tracked)
     }
 
     /// The value of the objective at u, with the best slack.
@@ -42,6 +43,7 @@ impl Tracking {
 }
 
 /// Solves the program; `None` when no acceleration satisfies the rows.
+#[inline]
 pub fn solve(tracking: &Tracking, interval: &Interval) -> Option<f64> {
     if interval.is_empty() {
         return None;

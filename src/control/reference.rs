@@ -348,6 +348,7 @@ impl Reference {
     /// Reference speed and acceleration for a vehicle that is at `x_m` at instant `t_s`, found through
     /// the reference time t_ref at which the plan is at the same position (section "Control and speed
     /// reference trajectories"); t_ref is kept within the plan.
+    #[inline]
     pub fn at(&self, feedback: PositionFeedback, t_s: f64, x_m: f64) -> (f64, f64) {
         let duration = self.optimum.duration_s;
         let distance = x_m - self.origin_m;

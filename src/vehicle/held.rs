@@ -1,5 +1,7 @@
 //! Motion over one step with the acceleration held (paper: `VehicleDynamics`).
 
+use std::hint::select_unpredictable;
+
 /// Motion from `(x0, v0)` under a held acceleration, for any time up to one step.
 ///
 /// A vehicle that would reverse stops at `v = 0` and stays there; the instant is exact.
@@ -18,7 +20,8 @@ pub struct Held {
 impl Held {
     /// Starts at position `x0_m` with speed `v0_mps >= 0` under acceleration `u_mps2`.
     pub fn new(x0_m: f64, v0_mps: f64, u_mps2: f64) -> Held {
-        let stop_s = if u_mps2 < 0.0 { v0_mps / -u_mps2 } else { f64::INFINITY };
+        // A vehicle brakes or does not with about equal odds: no branch could be foretold.
+        let stop_s = select_unpredictable(u_mps2 < 0.0, v0_mps / -u_mps2, f64::INFINITY);
         Held { x0_m, v0_mps, u_mps2, stop_s }
     }
 
@@ -62,6 +65,7 @@ impl Held {
 
     /// Least value over `[0, within_s]` of `leader - self + shift_m - reaction_s * v - gap_m`, m: the
     /// rear-end margin between samples as well as at them.
+    #[inline]
     pub fn least_margin_m(
         &self,
         leader: &Held,

@@ -9,6 +9,7 @@ use super::car::{Car, Guard};
 use super::link::LinkCar;
 use super::metrics::{ShieldRow, ShieldSummary};
 use super::role::World;
+use crate::lanes::AHEAD;
 use crate::scenario::{Drivers, Exit, Scenario, ShieldMode};
 use crate::shield::{Duty, Partner, RESERVE_M, Row, Shield};
 use crate::vehicle::Held;
@@ -172,6 +173,7 @@ impl World {
                 Some(driver) if driver != sender => continue,
                 driver => driver.is_none(),
             };
+            self.cars.fetch(zone as usize + AHEAD);
             let first = self.sites[zone as usize].first();
             for car in &mut self.cars[zone as usize][first..] {
                 if shared && drivers.of(zone, car.path) != sender {

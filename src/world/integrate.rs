@@ -5,6 +5,7 @@ use super::gate::{Queue, may_enter};
 use super::link::{Link, LinkCar};
 use super::metrics::CompletedVisit;
 use super::role::World;
+use crate::lanes::AHEAD;
 use crate::scenario::{Exit, Scenario, ZoneId};
 use crate::vehicle::{Held, Merge, Pair, RearEnd, satisfiable_at};
 use ipc_schemas::{VERDICT_FE, VERDICT_INFEASIBLE};
@@ -38,6 +39,7 @@ impl World {
         // All that concerns a zone at one go, while its vehicles are in the cache. Motions start from the
         // step's beginning, so it does not matter which zone has moved on already.
         for zone in 0..self.sites.len() {
+            self.cars.fetch(zone + AHEAD);
             let crosses = self.look(&scenario, zone, dt_s);
             self.sites[zone].left_now = crosses;
             if crosses {

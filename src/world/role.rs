@@ -6,7 +6,7 @@ use super::gateway::Gateway;
 use super::integrate::{Entry, Leader};
 use super::link::Link;
 use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics};
-use crate::lanes::Lanes;
+use crate::lanes::{AHEAD, Lanes};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Exit, Scenario, ZoneId};
 use crate::vehicle::Held;
@@ -227,6 +227,7 @@ impl World {
 
     /// A zone's S(t).
     fn zone_records(&self, zone: ZoneId) -> impl Iterator<Item = VehicleState> + '_ {
+        self.cars.fetch(zone as usize + AHEAD);
         let site = &self.sites[zone as usize];
         let left_flags = frames::STATE_LEFT | if site.left_now { frames::STATE_LEFT_NOW } else { 0 };
         let (left, members) = self.cars[zone as usize].split_at(site.first());
