@@ -14,6 +14,7 @@ use std::sync::Arc;
 #[derive(Debug)]
 pub struct ControllerPool {
     law: Law,
+    v_max_mps: f64,
     zones: Range<ZoneId>,
     /// Lengths of each zone's approaches, m.
     lengths_m: Lanes<f64>,
@@ -128,6 +129,7 @@ impl ControllerPool {
         let plugged = scenario.plugins.iter().flat_map(|p| p.approaches.iter().copied());
         ControllerPool {
             law: Law::new(&scenario),
+            v_max_mps: scenario.vehicle.v_max_mps,
             lengths_m,
             members: Lanes::new(count),
             constraints: Lanes::new(count),
@@ -161,8 +163,7 @@ impl ControllerPool {
                 drift = from.wrapping_sub(self.starts[lane]);
                 let slice = states[from..].chunk_by(|a, b| a.zone == b.zone).next().unwrap_or(&[]);
                 let slice = if slice.first().is_some_and(|s| s.zone == zone) { slice } else { &[] };
-                let v_max_mps = self.scenario.vehicle.v_max_mps;
-                self.crew.assign(zone, slice, group, &self.members[lane], v_max_mps)?;
+                self.crew.assign(zone, slice, group, &self.members[lane], self.v_max_mps)?;
                 self.members.set(lane, &self.crew.members);
                 self.constraints.set(lane, &self.crew.constraints);
             }
