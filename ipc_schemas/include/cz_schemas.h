@@ -41,6 +41,9 @@
 #define CZ_ROLE_CONTROLLER UINT16_C(3)
 /** `cz_frame_header_t.flags`: this is the last state frame of the run; answer nothing, detach. */
 #define CZ_FLAG_END_OF_RUN UINT32_C(1)
+/** `cz_frame_header_t.flags`: in the step before, the world put in commands for a controller that
+ *  had not answered in time. What the controllers remember is what was applied, not what they sent. */
+#define CZ_FLAG_MISSED UINT32_C(2)
 
 /** No vehicle: the value of a vehicle field that names nobody. */
 #define CZ_NO_VEHICLE UINT32_C(4294967295)
@@ -82,6 +85,12 @@
 #define CZ_VERDICT_BOUND UINT16_C(2)
 /** `cz_vehicle_command_t.verdict`: no command satisfies all rows; `u_min` was sent. */
 #define CZ_VERDICT_INFEASIBLE UINT16_C(3)
+/** `cz_vehicle_command_t.verdict`: the controller missed its deadline; the acceleration before is
+ *  held. */
+#define CZ_VERDICT_HELD UINT16_C(4)
+/** `cz_vehicle_command_t.verdict`: the controller missed its deadline; the acceleration before is
+ *  held as far as the shield allows. */
+#define CZ_VERDICT_FALLBACK UINT16_C(5)
 
 /** `cz_attach_request_t.controller`: a process of the built-in pool, or a coordinator. */
 #define CZ_BUILT_IN UINT64_C(0)
@@ -94,6 +103,8 @@
 /** `cz_attach_request_t.phase`: has been admitted, has opened its ends of the services, and can
  *  start. */
 #define CZ_ATTACH_READY UINT32_C(2)
+/** `cz_attach_request_t.phase`: has fallen behind the run and asks for what it needs to catch up. */
+#define CZ_ATTACH_RESTORE UINT32_C(3)
 /** `cz_attach_reply_t.waiting`: hot processes poll, coordinators sleep. */
 #define CZ_WAITING_HYBRID UINT32_C(0)
 /** `cz_attach_reply_t.waiting`: everyone spins. */
@@ -112,6 +123,8 @@
 #define CZ_ATTACH_BAD_ROLE UINT32_C(4)
 /** `cz_attach_reply_t.status`: the scenario declares no controller of that name. */
 #define CZ_ATTACH_NO_CONTROLLER UINT32_C(5)
+/** `cz_attach_reply_t.status`: the run is under way and does without newcomers. */
+#define CZ_ATTACH_UNDER_WAY UINT32_C(6)
 
 /** `cz_approach_spec_t.flags`: the controller that asked drives this approach. */
 #define CZ_APPROACH_OWN UINT32_C(1)
@@ -150,6 +163,9 @@
 #define CZ_SERVICE_SUMMARY_PREFIX "cz/summary/"
 /** Controllers -> world: `cz_vehicle_command_t` of every step. */
 #define CZ_SERVICE_COMMAND "cz/command"
+/** World -> whoever records the run: every step as one block of bytes. Overflows, so that nobody
+ *  waits for its reader. */
+#define CZ_SERVICE_OBSERVER "cz/observer"
 /** Bell of the world, rung by controllers when everyone blocks. */
 #define CZ_BELL_WORLD "cz/bell/world"
 /** Bell of coordinator `i`; `i` is appended. */
@@ -201,7 +217,7 @@ typedef struct cz_frame_header {
     uint32_t generation;
     /** Number of records that follow. */
     uint32_t record_count;
-    /** Bit 0: end of run. */
+    /** Bit 0: end of run. Bit 1: commands were put in in the step before. */
     uint32_t flags;
 } cz_frame_header_t;
 CZ_ASSERT_(frame_header_size, sizeof(cz_frame_header_t) == 64);
@@ -365,7 +381,8 @@ typedef struct cz_vehicle_command {
     uint32_t binding_rows;
     /** Memory: 0 entered, 1 FE, 2 OCBF. */
     uint16_t mode;
-    /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible. */
+    /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; put in by the world when a deadline was
+     *  missed: 4 held, 5 held within what the shield allows. */
     uint16_t verdict;
 } cz_vehicle_command_t;
 CZ_ASSERT_(vehicle_command_size, sizeof(cz_vehicle_command_t) == 96);
@@ -407,7 +424,7 @@ typedef struct cz_attach_request {
     uint16_t role;
     /** Index wanted among the processes of the role, or 65535 for any. */
     uint16_t wanted_index;
-    /** 1 join, 2 ready. */
+    /** 1 join, 2 ready, 3 restore. */
     uint32_t phase;
     /** Index assigned in the reply to the join; 0 while joining. */
     uint32_t index;

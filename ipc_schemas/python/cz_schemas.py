@@ -21,6 +21,9 @@ ROLE_COORDINATOR = 2
 ROLE_CONTROLLER = 3
 #: `FrameHeader.flags`: this is the last state frame of the run; answer nothing, detach.
 FLAG_END_OF_RUN = 1
+#: `FrameHeader.flags`: in the step before, the world put in commands for a controller that had not
+#: answered in time. What the controllers remember is what was applied, not what they sent.
+FLAG_MISSED = 2
 
 #: No vehicle: the value of a vehicle field that names nobody.
 NO_VEHICLE = 4294967295
@@ -60,6 +63,11 @@ VERDICT_FE = 1
 VERDICT_BOUND = 2
 #: `VehicleCommand.verdict`: no command satisfies all rows; `u_min` was sent.
 VERDICT_INFEASIBLE = 3
+#: `VehicleCommand.verdict`: the controller missed its deadline; the acceleration before is held.
+VERDICT_HELD = 4
+#: `VehicleCommand.verdict`: the controller missed its deadline; the acceleration before is held as
+#: far as the shield allows.
+VERDICT_FALLBACK = 5
 
 #: `AttachRequest.controller`: a process of the built-in pool, or a coordinator.
 BUILT_IN = 0
@@ -71,6 +79,8 @@ ANY_SCENARIO = 0
 ATTACH_JOIN = 1
 #: `AttachRequest.phase`: has been admitted, has opened its ends of the services, and can start.
 ATTACH_READY = 2
+#: `AttachRequest.phase`: has fallen behind the run and asks for what it needs to catch up.
+ATTACH_RESTORE = 3
 #: `AttachReply.waiting`: hot processes poll, coordinators sleep.
 WAITING_HYBRID = 0
 #: `AttachReply.waiting`: everyone spins.
@@ -89,6 +99,8 @@ ATTACH_NO_ROOM = 3
 ATTACH_BAD_ROLE = 4
 #: `AttachReply.status`: the scenario declares no controller of that name.
 ATTACH_NO_CONTROLLER = 5
+#: `AttachReply.status`: the run is under way and does without newcomers.
+ATTACH_UNDER_WAY = 6
 
 #: `ApproachSpec.flags`: the controller that asked drives this approach.
 APPROACH_OWN = 1
@@ -126,6 +138,9 @@ SERVICE_COORDINATION = "cz/coordination"
 SERVICE_SUMMARY_PREFIX = "cz/summary/"
 #: Controllers → world: `VehicleCommand` of every step.
 SERVICE_COMMAND = "cz/command"
+#: World → whoever records the run: every step as one block of bytes. Overflows, so that nobody
+#: waits for its reader.
+SERVICE_OBSERVER = "cz/observer"
 #: Bell of the world, rung by controllers when everyone blocks.
 BELL_WORLD = "cz/bell/world"
 #: Bell of coordinator `i`; `i` is appended.
@@ -158,7 +173,7 @@ class FrameHeader(ctypes.Structure):
         sender_index: Index of the sender among the processes of its role.
         generation: Generation of the sender: 0 at first, one more after each restart.
         record_count: Number of records that follow.
-        flags: Bit 0: end of run.
+        flags: Bit 0: end of run. Bit 1: commands were put in in the step before.
     """
 
     _fields_ = [
@@ -320,7 +335,8 @@ class VehicleCommand(ctypes.Structure):
         binding_rows: Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4
             rear end, 5 rear-end feasibility, 6 merge, 7 merge feasibility.
         mode: Memory: 0 entered, 1 FE, 2 OCBF.
-        verdict: 0 nominal, 1 FE, 2 bound by rows, 3 infeasible.
+        verdict: 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; put in by the world when a deadline
+            was missed: 4 held, 5 held within what the shield allows.
     """
 
     _fields_ = [
@@ -363,7 +379,7 @@ class AttachRequest(ctypes.Structure):
         process_id: Process id, for liveness checks and messages.
         role: 2 coordinator, 3 controller.
         wanted_index: Index wanted among the processes of the role, or 65535 for any.
-        phase: 1 join, 2 ready.
+        phase: 1 join, 2 ready, 3 restore.
         index: Index assigned in the reply to the join; 0 while joining.
     """
 

@@ -14,6 +14,9 @@ codes! {
     pub const SERVICE_SUMMARY_PREFIX: &str = "cz/summary/";
     /// Controllers → world: [`VehicleCommand`](crate::VehicleCommand) of every step.
     pub const SERVICE_COMMAND: &str = "cz/command";
+    /// World → whoever records the run: every step as one block of bytes. Overflows, so that nobody waits for
+    /// its reader.
+    pub const SERVICE_OBSERVER: &str = "cz/observer";
     /// Bell of the world, rung by controllers when everyone blocks.
     pub const BELL_WORLD: &str = "cz/bell/world";
     /// Bell of coordinator `i`; `i` is appended.

@@ -39,6 +39,10 @@ pub(super) enum Command {
     Verify(VerifyArgs),
     /// Run every role of a recording again from its recorded inputs and compare.
     Replay(ReplayArgs),
+    /// Go on with an interrupted run from its recording, to the same result.
+    Resume(ResumeArgs),
+    /// Run a recorded run's future from a step on with other settings, beside the one it had.
+    Branch(BranchArgs),
     /// Regenerate the paper's tables and figures with intervals, verdicts and errata.
     Reproduce(ReproduceArgs),
     /// Measure latency, the solver, or scale on this machine.
@@ -184,6 +188,11 @@ pub(super) struct ScenarioArgs {
 const CORRIDORS_UNTIL_S: f64 = 90.0;
 
 impl ScenarioArgs {
+    /// Nothing said: somebody else decides.
+    pub const fn none() -> ScenarioArgs {
+        ScenarioArgs { scenario: None, seed: None, set: Vec::new(), corridors: None }
+    }
+
     /// Loads and validates the scenario.
     pub fn load(&self) -> Result<Scenario, ScenarioError> {
         if let Some(vehicles) = self.corridors {
@@ -390,6 +399,18 @@ pub(super) struct WorldArgs {
     pub restart: Restart,
     #[command(flatten)]
     pub timing: TimingArgs,
+    /// Record every frame of the run in this file (.czlog); an older recording is replaced.
+    #[arg(long, value_name = "FILE")]
+    pub record: Option<PathBuf>,
+    /// Begin only once somebody looks on.
+    #[arg(long, hide = true)]
+    pub observed: bool,
+    /// The run's id.
+    #[arg(long, hide = true, value_name = "ID")]
+    pub run_id: Option<u64>,
+    /// Go on from this recording, which decides the scenario and the numbers of processes.
+    #[arg(long, hide = true, value_name = "FILE")]
+    pub resume: Option<PathBuf>,
     /// Process id of the supervisor: report to it on stdout, and end with it.
     #[arg(long, hide = true, value_name = "PID")]
     pub supervised: Option<u32>,
@@ -471,6 +492,43 @@ pub(super) struct VerifyArgs {
 pub(super) struct ReplayArgs {
     /// The recording.
     pub file: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct ResumeArgs {
+    /// The recording; it decides the scenario and the numbers of processes.
+    pub file: PathBuf,
+    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+    /// Name of the run; runs of different names do not see each other [default: one of its own].
+    #[arg(long, value_name = "NAME")]
+    pub run: Option<RunName>,
+    #[command(flatten)]
+    pub wait: WaitArgs,
+    /// How the processes of the run wait for frames.
+    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
+    pub wait_mode: WaitMode,
+    /// What becomes of the run when a coordinator or a process of the built-in pool dies.
+    #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
+    pub restart: Restart,
+    #[command(flatten)]
+    pub timing: TimingArgs,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct BranchArgs {
+    /// The recording.
+    pub file: PathBuf,
+    /// The first step of the other future.
+    #[arg(long, value_name = "STEP")]
+    pub at: u64,
+    /// Change a scenario key from then on, e.g. `--set zones.merge-1.flow.gain_mps=0.3`; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE", required = true)]
+    pub set: Vec<String>,
     /// Print JSON.
     #[arg(long)]
     pub json: bool,

@@ -6,7 +6,7 @@ use super::{AppError, print};
 use crate::bench::{
     self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport, Sumo,
 };
-use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, run_in_process};
+use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, new_run_id, run_in_process};
 use crate::transport::iox::RunName;
 use comfy_table::{CellAlignment, Table, presets};
 use std::path::Path;
@@ -77,8 +77,10 @@ fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, S
         wait_mode: WaitMode::Hybrid,
         restart: Restart::Never,
         timing: TimingArgs::default(),
+        run_id: new_run_id(),
+        resume: None,
     };
-    supervise(&plan, |_| {}).map_err(|e| e.to_string())
+    supervise(&plan, None, |_| {}).0.map_err(|e| e.to_string())
 }
 
 fn own_name() -> RunName {

@@ -10,6 +10,7 @@ mod plan;
 mod plugin;
 mod record;
 mod report;
+mod resume;
 mod run;
 mod sdk;
 mod show;
@@ -89,6 +90,8 @@ pub fn cz() -> ExitCode {
             args::Command::Show(args) => show::show(&args),
             args::Command::Verify(args) => record::verify(&args),
             args::Command::Replay(args) => record::replay(&args),
+            args::Command::Resume(args) => resume::resume(&args),
+            args::Command::Branch(args) => resume::branch(&args),
             args::Command::Reproduce(args) => reproduce::cli::main(&args).map_err(AppError::from),
             args::Command::Clean(args) => clean::clean(&args),
             args::Command::Bench(args) => bench::bench(&args),

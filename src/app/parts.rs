@@ -1,11 +1,13 @@
 //! `cz world`, `cz coord`, `cz ctrl`: one process of a run.
 
-use super::AppError;
 use super::args::{PartArgs, Restart, WaitArgs, WorldArgs};
+use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::supervise::{SettledLine, WorldLine};
+use super::{AppError, record};
 use crate::process::{
-    Joining, Settled, Settling, StopFlag, WorldOptions, run_controller, run_coordinator, run_world,
+    Joining, Observation, Settled, Settling, StopFlag, WorldOptions, new_run_id, run_controller,
+    run_coordinator, run_world,
 };
 use crate::scenario::scenario_hash;
 use crate::world::World;
@@ -18,26 +20,41 @@ use std::time::{Duration, Instant};
 const REPORT_EVERY: Duration = Duration::from_millis(50);
 
 pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
-    let scenario = Arc::new(args.scenario.load()?);
-    args.share.check(&scenario)?;
+    let resume = args.resume.as_deref().map(record::open).transpose()?;
+    let (scenario, share) = match &resume {
+        None => (Arc::new(args.scenario.load()?), args.share),
+        Some(reader) => (reader.scenario().clone(), record::share_of(reader)),
+    };
+    share.check(&scenario)?;
     let stop = StopFlag::from_signals()?;
     follow_supervisor(args.supervised)?;
+    let run_id = args.run_id.unwrap_or_else(new_run_id);
+    let observation = match &args.record {
+        Some(path) => {
+            let recording = Recording::start(path, &args.scenario, &scenario, share, run_id)?;
+            let push = |r: &mut Recording, step, block: &[u8]| r.push_block(step, block);
+            Some(Observation::start(args.run.clone(), recording, push))
+        }
+        None => None,
+    };
     let options = WorldOptions {
         run: args.run.clone(),
-        coordinators: args.share.coord_procs,
-        controllers: scenario.controllers(args.share.ctrl_procs),
+        coordinators: share.coord_procs,
+        controllers: scenario.controllers(share.ctrl_procs),
         attach_timeout: args.wait.attach_timeout,
         peer_timeout: args.wait.peer_timeout,
         wait: args.wait_mode,
         replace: args.restart == Restart::OnFailure,
         timing: args.timing.timing()?,
+        observed: args.observed || observation.is_some(),
+        run_id: Some(run_id),
     };
     let hot_processes = args.wait_mode.hot_processes(options.coordinators, options.controllers);
     let report = report_to(args.supervised, &args.wait);
     settling(&args.wait, &*report).settle(Role::World, 0, args.wait_mode, hot_processes);
     if args.supervised.is_some() {
         let mut last = Instant::now();
-        let outcome = run_world(&scenario, &options, &stop, |world| {
+        let outcome = run_world(&scenario, &options, resume.as_ref(), &stop, |world| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
                 say(&WorldLine::progress(world));
@@ -46,9 +63,16 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         say(&WorldLine::Outcome(Box::new(outcome)));
         return Ok(());
     }
-    let outcome = run_world(&scenario, &options, &stop, |_: &World| {})?;
+    let outcome = run_world(&scenario, &options, resume.as_ref(), &stop, |_: &World| {});
+    let outcome = outcome.map_err(AppError::from);
+    let recorded = match observation {
+        Some(observation) => observation.stop()?.finish(&outcome),
+        None => Ok(()),
+    };
+    let outcome = outcome?;
     let processes = 1 + options.coordinators + options.controllers;
-    Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome).deliver(args.json.as_deref())
+    Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome).deliver(args.json.as_deref())?;
+    recorded
 }
 
 pub(super) fn coordinator(args: &PartArgs) -> Result<(), AppError> {

@@ -3,7 +3,6 @@
 use super::args::{ReplayArgs, ScenarioArgs, ShareArgs, VerifyArgs};
 use super::show::number;
 use super::{AppError, print};
-use crate::process::ProcessError;
 use crate::record::{
     FileSource, Flaw, Metadata, Processes, Reader, RecordError, Recorder, Replay, RunEnd, ScenarioSource,
     StepFrames, Stop, compare, replay as replay_roles,
@@ -56,11 +55,16 @@ impl Recording {
         self.recorder.push_or_wait(frames);
     }
 
+    /// Records the block of a step of a run in other processes; never waits.
+    pub fn push_block(&mut self, step: u64, block: &[u8]) {
+        self.recorder.push_block(step, block);
+    }
+
     /// Ends the recording and says on stderr what is in it.
-    pub fn finish<T>(self, outcome: &Result<T, ProcessError>) -> Result<(), AppError> {
+    pub fn finish<T>(self, outcome: &Result<T, AppError>) -> Result<(), AppError> {
         let end = match outcome {
             Ok(_) => RunEnd::Finished,
-            Err(ProcessError::Interrupted { .. }) => RunEnd::Interrupted,
+            Err(AppError::Interrupted(_)) => RunEnd::Interrupted,
             Err(error) => RunEnd::Failed { reason: error.to_string() },
         };
         let recorded = self.recorder.finish(end)?;
@@ -80,6 +84,16 @@ impl Recording {
 /// A recording, or why it cannot be read.
 pub(super) fn open(path: &Path) -> Result<Reader<FileSource>, AppError> {
     Reader::open(path).map_err(|error| AppError::Usage(format!("{}: {error}", path.display())))
+}
+
+/// The numbers of processes of a recorded run.
+pub(super) fn share_of(reader: &Reader<FileSource>) -> ShareArgs {
+    let metadata = reader.metadata();
+    let plugins = reader.scenario().plugins.len() as u32;
+    ShareArgs {
+        ctrl_procs: metadata.controllers.saturating_sub(plugins).max(1),
+        coord_procs: metadata.coordinators,
+    }
 }
 
 /// Ranges in words, the first few of many.

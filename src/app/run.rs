@@ -6,7 +6,9 @@ use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
 use super::{AppError, controllers};
 use crate::lockstep::in_process::InProcess;
-use crate::process::{Placement, StopFlag, WaitMode, check_cores, run_in_process, run_in_process_observed};
+use crate::process::{
+    Placement, StopFlag, WaitMode, check_cores, new_run_id, run_in_process, run_in_process_observed,
+};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::World;
@@ -26,10 +28,6 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         let problem = "--in-process: the scenario has controllers that are processes of their own";
         return Err(AppError::Usage(problem.to_owned()));
     }
-    if args.record.is_some() && !args.in_process {
-        let problem = "--record: runs of several processes cannot be recorded yet; add --in-process";
-        return Err(AppError::Usage(problem.to_owned()));
-    }
     args.timing.timing()?;
     if args.in_process && args.timing.is_given() {
         let problem =
@@ -44,19 +42,22 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         let (coordinators, controllers) = (shares.coord_procs, shares.ctrl_procs);
         let progress = |world: &World| bar.show(Position::of(world));
         let outcome = match &args.record {
-            None => run_in_process(&scenario, coordinators, controllers, &stop, progress),
+            None => {
+                run_in_process(&scenario, coordinators, controllers, &stop, progress).map_err(AppError::from)
+            }
             Some(path) => {
                 let mut recording = Recording::start(path, &arguments, &scenario, shares, InProcess::RUN_ID)?;
                 let outcome =
                     run_in_process_observed(&scenario, coordinators, controllers, &stop, progress, |f| {
                         recording.push(f);
-                    });
+                    })
+                    .map_err(AppError::from);
                 bar.finish();
                 recorded = recording.finish(&outcome);
                 outcome
             }
         };
-        (Transport::InProcess, outcome.map_err(AppError::from))
+        (Transport::InProcess, outcome)
     } else {
         let processes = 1 + args.share.coord_procs + scenario.controllers(args.share.ctrl_procs);
         let plan = Plan {
@@ -69,8 +70,19 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
             wait_mode: args.wait_mode,
             restart: args.restart,
             timing: args.timing,
+            run_id: new_run_id(),
+            resume: None,
         };
-        (Transport::Iceoryx2 { processes }, supervise::supervise(&plan, |position| bar.show(position)))
+        let recording = match &args.record {
+            Some(path) => Some(Recording::start(path, &arguments, &scenario, args.share, plan.run_id)?),
+            None => None,
+        };
+        let (outcome, recording) = supervise::supervise(&plan, recording, |position| bar.show(position));
+        bar.finish();
+        if let Some(recording) = recording {
+            recorded = recording.finish(&outcome);
+        }
+        (Transport::Iceoryx2 { processes }, outcome)
     };
     bar.finish();
     let asked = args.wait.rt || args.wait.pin != Placement::None;
@@ -80,7 +92,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
 }
 
 /// A run name nobody else has.
-fn own_name() -> RunName {
+pub(super) fn own_name() -> RunName {
     format!("cz-{}", std::process::id()).parse().expect("letters, a dash and digits are a run name")
 }
 
@@ -100,14 +112,14 @@ impl Position {
 }
 
 /// The progress bar: vehicles when their number is known, simulated time otherwise.
-struct Bar {
+pub(super) struct Bar {
     bar: ProgressBar,
     by_vehicle: bool,
     dt_s: f64,
 }
 
 impl Bar {
-    fn new(scenario: &Scenario) -> Bar {
+    pub fn new(scenario: &Scenario) -> Bar {
         let length = scenario.max_vehicles.map_or(scenario.max_time_s as u64, u64::from);
         // Hidden by itself when stderr is no terminal.
         let bar = ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr());
@@ -116,14 +128,14 @@ impl Bar {
         Bar { bar, by_vehicle: scenario.max_vehicles.is_some(), dt_s: scenario.dt_s() }
     }
 
-    fn show(&self, position: Position) {
+    pub fn show(&self, position: Position) {
         let time_s = position.step as f64 * self.dt_s;
         self.bar.set_position(if self.by_vehicle { u64::from(position.departed) } else { time_s as u64 });
         let inside = position.arrived - position.departed;
         self.bar.set_message(format!("step {}, {time_s:.0} s, {inside} vehicles", position.step));
     }
 
-    fn finish(&self) {
+    pub fn finish(&self) {
         self.bar.finish_and_clear();
     }
 }

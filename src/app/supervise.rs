@@ -2,8 +2,9 @@
 
 use super::AppError;
 use super::args::{Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs};
+use super::record::Recording;
 use super::run::Position;
-use crate::process::{Outcome, ProcessError, Settled, WaitMode};
+use crate::process::{Observation, Outcome, ProcessError, Settled, WaitMode};
 use crate::scenario::Plugin;
 use crate::transport::iox::{RunName, RunSpace};
 use crate::world::World;
@@ -13,6 +14,7 @@ use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 use serde::{Deserialize, Serialize};
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
 
@@ -63,6 +65,10 @@ pub(super) struct Plan<'a> {
     pub restart: Restart,
     /// When steps begin, and what becomes of late ones.
     pub timing: TimingArgs,
+    /// Id of the run.
+    pub run_id: u64,
+    /// The recording the run goes on from.
+    pub resume: Option<&'a Path>,
 }
 
 /// A part that dies this often, each time soon after it was started, is given up.
@@ -75,8 +81,32 @@ const BACK_OFF: Duration = Duration::from_millis(10);
 /// How long the others may take to end by themselves once one has failed, and once asked to.
 const GRACE: Duration = Duration::from_secs(2);
 
-/// Starts everything, waits for the end, and returns the world's outcome.
-pub(super) fn supervise(plan: &Plan<'_>, progress: impl FnMut(Position)) -> Result<Outcome, AppError> {
+/// Starts everything, waits for the end, and returns the world's outcome, and the recording with all of it
+/// that is to be in it.
+pub(super) fn supervise(
+    plan: &Plan<'_>,
+    recording: Option<Recording>,
+    progress: impl FnMut(Position),
+) -> (Result<Outcome, AppError>, Option<Recording>) {
+    if let Err(error) = claim(&plan.run) {
+        return (Err(error), recording);
+    }
+    let observed = recording.is_some();
+    let observation = recording
+        .map(|r| Observation::start(plan.run.clone(), r, |r: &mut Recording, step, b| r.push_block(step, b)));
+    let result = oversee(plan, observed, progress);
+    let recording = observation.and_then(|observation| match observation.stop() {
+        Ok(recording) => Some(recording),
+        Err(error) => {
+            eprintln!("cz: the recording broke off: {error}");
+            None
+        }
+    });
+    sweep(&plan.run);
+    (result, recording)
+}
+
+fn oversee(plan: &Plan<'_>, observed: bool, progress: impl FnMut(Position)) -> Result<Outcome, AppError> {
     // Signals first: from here on a Ctrl-C ends the children in order.
     let (signal_sender, signals) = unbounded();
     let mut source =
@@ -88,15 +118,13 @@ pub(super) fn supervise(plan: &Plan<'_>, progress: impl FnMut(Position)) -> Resu
         }
     });
 
-    claim(&plan.run)?;
     let (events, inbox) = unbounded();
     let mut family =
         Family { children: Vec::new(), plugins: Vec::new(), events, restart: plan.restart, due: Vec::new() };
-    let result = family.start(plan).and_then(|()| family.watch(&inbox, &signals, progress));
+    let result = family.start(plan, observed).and_then(|()| family.watch(&inbox, &signals, progress));
     if result.is_err() {
         family.end(&inbox);
     }
-    sweep(&plan.run);
     result
 }
 
@@ -161,7 +189,7 @@ struct Member {
 }
 
 impl Family {
-    fn start(&mut self, plan: &Plan<'_>) -> Result<(), AppError> {
+    fn start(&mut self, plan: &Plan<'_>, observed: bool) -> Result<(), AppError> {
         let timeout = |d: Duration| d.as_secs_f64().to_string();
         let mut common: Vec<String> = ["--run", &plan.run.to_string()].map(str::to_owned).to_vec();
         common.extend(["--attach-timeout".to_owned(), timeout(plan.wait.attach_timeout)]);
@@ -177,6 +205,9 @@ impl Family {
         world.extend(["--wait".to_owned(), name(plan.wait_mode.to_possible_value())]);
         world.extend(["--restart".to_owned(), name(plan.restart.to_possible_value())]);
         world.extend(plan.timing.to_flags());
+        world.extend(["--run-id".to_owned(), plan.run_id.to_string()]);
+        world.extend(observed.then(|| "--observed".to_owned()));
+        world.extend(plan.resume.map(|path| format!("--resume={}", path.display())));
         world.extend(plan.scenario.to_arguments());
         self.spawn(Part { name: "world".to_owned(), command: "world", arguments: world, restarts: 0 })?;
         for (role, command, count) in

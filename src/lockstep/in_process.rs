@@ -1,17 +1,19 @@
 //! A whole run in one thread: every driver in turn, over the memory transport.
 
 use super::{
-    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity, LockstepError,
-    Progress, WorldDriver, WorldPorts,
+    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Handover, Identity, Ledger,
+    LockstepError, Progress, WorldDriver, WorldPorts,
 };
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
-use crate::record::{CommandPart, POLICY_NONE, StepFrames};
+use crate::record::{
+    CommandPart, Metadata, POLICY_NONE, Reader, ReplayError, Source, StepFrames, replay_world,
+};
 use crate::scenario::Scenario;
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::transport::memory::{MemoryFrame, MemoryInbox, MemoryOutbox, MemoryService};
 use crate::transport::{Frame, Inbox};
-use crate::world::World;
+use crate::world::{ChangeError, World};
 use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::sync::Arc;
 
@@ -49,6 +51,17 @@ struct Observer {
     command: MemoryInbox<VehicleCommand>,
 }
 
+/// Why a recorded run cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum RestoreError {
+    /// The recording cannot be replayed that far.
+    #[error(transparent)]
+    Replay(#[from] ReplayError),
+    /// The other scenario is too different.
+    #[error(transparent)]
+    Change(#[from] ChangeError),
+}
+
 impl InProcess {
     /// The run id of all frames.
     pub const RUN_ID: u64 = 1;
@@ -56,16 +69,50 @@ impl InProcess {
     /// A run of the scenario with that many coordinator and controller roles. The built-in law stands in
     /// for every plug-in.
     pub fn new(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32) -> InProcess {
-        InProcess::build(scenario, coordinators, controllers, false)
+        InProcess::build(World::new(InProcess::own(scenario), coordinators), coordinators, controllers, false)
+    }
+
+    /// A recorded run that goes on before a step, under another scenario if there is one.
+    pub fn from_recording<S: Source>(
+        reader: &Reader<S>,
+        step: u64,
+        scenario: Option<Arc<Scenario>>,
+    ) -> Result<InProcess, RestoreError> {
+        let Metadata { coordinators, controllers, .. } = *reader.metadata();
+        let mut world = replay_world(reader, step)?;
+        if let Some(scenario) = scenario {
+            world.change(scenario)?;
+        }
+        let mut ledger = Ledger::<MemoryFrame<VehicleCommand>>::new(world.scenario(), controllers);
+        for recorded in reader.steps() {
+            let recorded = recorded.map_err(ReplayError::from)?;
+            if recorded.header.step >= step {
+                break;
+            }
+            ledger.relive(&recorded);
+        }
+        let mut run = InProcess::build(world, coordinators, controllers, false);
+        for (index, coordinator) in run.coordinators.iter_mut().enumerate() {
+            coordinator.take_over(Handover { step, ..ledger.handover(Role::Coordinator, index) });
+        }
+        for (index, controller) in run.controllers.iter_mut().enumerate() {
+            controller.take_over(Handover { step, ..ledger.handover(Role::Controller, index) });
+        }
+        Ok(run)
+    }
+
+    /// The scenario without plug-ins.
+    fn own(scenario: &Arc<Scenario>) -> Arc<Scenario> {
+        Arc::new(scenario.without_plugins())
     }
 
     /// The same, and [`frames`](Self::frames) must be asked for after each step.
     pub fn observed(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32) -> InProcess {
-        InProcess::build(scenario, coordinators, controllers, true)
+        InProcess::build(World::new(InProcess::own(scenario), coordinators), coordinators, controllers, true)
     }
 
-    fn build(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32, observed: bool) -> InProcess {
-        let scenario = &Arc::new(scenario.without_plugins());
+    fn build(world: World, coordinators: u32, controllers: u32, observed: bool) -> InProcess {
+        let scenario = &world.scenario().clone();
         let zones = scenario.network.zones.len() as u32;
         let run_id = InProcess::RUN_ID;
         let mut state = MemoryService::new();
@@ -122,7 +169,6 @@ impl InProcess {
             command: command_inbox,
             coordination: None,
         };
-        let world = World::new(scenario.clone(), coordinators);
         InProcess {
             world: WorldDriver::new(world, ports, run_id, controllers),
             coordinators: coordinators_side,

@@ -8,9 +8,10 @@
 //! there arrives twice and is the same.
 
 use crate::coordination::{Audience, is_event};
+use crate::record::Step;
 use crate::scenario::Scenario;
 use crate::transport::Frame;
-use ipc_schemas::{Assignment, FrameHeader, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{Assignment, FrameHeader, Role, VehicleCommand, VehicleState, ZoneSummary};
 use serde::{Deserialize, Serialize};
 
 /// What a participant needs in order to go on from the present step.
@@ -154,6 +155,26 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
         }
     }
 
+    /// Enters a whole step, of a run that goes on from a recording.
+    pub fn relive(&mut self, step: &Step) {
+        self.begin(&step.state, step.header.coordinators_acting != 0);
+        // Which process sent it does not matter once it is in force.
+        self.coordinate(0, &step.coordination);
+        let controllers = self.now.len();
+        for (index, part) in step.commands.iter().take(controllers).enumerate() {
+            self.substitute(index, part.records.clone());
+        }
+        self.end();
+    }
+
+    /// What a participant needs for the present step, besides its state.
+    pub fn handover(&self, role: Role, index: usize) -> Handover {
+        match role {
+            Role::Coordinator => self.to_coordinator(),
+            _ => self.to_controller(index),
+        }
+    }
+
     /// A controller's commands of the present step, and whether the world put them in.
     pub fn commands(&self, controller: usize) -> (&[VehicleCommand], bool) {
         let commands = &self.now[controller];
@@ -175,8 +196,7 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
         &self.fresh
     }
 
-    /// What a controller needs for the present step, besides its state.
-    pub fn to_controller(&self, controller: usize) -> Handover {
+    fn to_controller(&self, controller: usize) -> Handover {
         Handover {
             coordination: self.coordination.clone(),
             commands: self.commands_before(controller).to_vec(),
@@ -185,8 +205,7 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
         }
     }
 
-    /// What a coordinator needs for the present step, besides its state.
-    pub fn to_coordinator(&self) -> Handover {
+    fn to_coordinator(&self) -> Handover {
         let downstream = self.downstream.iter().flatten().copied();
         if self.has_begun {
             let (due, fresh) = (self.due.clone(), self.fresh.clone());

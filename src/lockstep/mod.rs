@@ -18,6 +18,7 @@ pub use refusals::{Refusal, RefusedFrames};
 pub use world::{Seat, WorldDriver, WorldPorts};
 
 use crate::control::pool::PoolError;
+use crate::record::StepFrames;
 use crate::transport::{Frame, TransportError};
 use ipc_schemas::{FrameHeader, HeaderFault, Role, VehicleState};
 
@@ -121,6 +122,12 @@ pub enum LockstepError {
         /// What is wrong.
         fault: PoolError,
     },
+}
+
+/// Whoever looks on.
+pub trait Observer: std::fmt::Debug {
+    /// A step has been answered, or is the last, which nobody answers.
+    fn observe(&mut self, frames: &StepFrames<'_>) -> Result<(), TransportError>;
 }
 
 /// A state to be answered.

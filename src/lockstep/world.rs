@@ -2,14 +2,16 @@
 
 use super::refusals::{Claim, Refusals};
 use super::{
-    Awaited, Handover, Identity, Ledger, LockstepError, Progress, Refusal, RefusedFrames, mask_of, sender,
+    Awaited, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal, RefusedFrames, mask_of,
+    sender,
 };
+use crate::record::{CommandPart, POLICY_NONE, StepFrames};
 use crate::scenario::share::zones_of;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use crate::world::World;
 use ipc_schemas::{
     Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, HeaderFault, Role, VehicleCommand,
-    VehicleState,
+    VehicleState, ZoneSummary,
 };
 
 /// The world's ends of the services.
@@ -65,6 +67,11 @@ where
     header: FrameHeader,
     /// Controllers for which the world put in commands in the present step, or the last one.
     put_in: u64,
+    /// The verdict of what was put in.
+    put_in_verdict: u16,
+    observer: Option<Box<dyn Observer>>,
+    /// The records of the state published last, for the observer.
+    published: Vec<VehicleState>,
     phase: Phase,
 }
 
@@ -113,8 +120,21 @@ where
             suspect: None,
             header: FrameHeader::default(),
             put_in: 0,
+            put_in_verdict: 0,
+            observer: None,
+            published: Vec::new(),
             phase: Phase::Publish,
         }
+    }
+
+    /// Shows every step to an observer from now on; needs the ledger.
+    pub fn observe(&mut self, observer: Box<dyn Observer>) {
+        self.observer = Some(observer);
+    }
+
+    /// Keeps a ledger that has been begun already, in place of its own.
+    pub fn keep(&mut self, ledger: Option<Ledger<M::Frame>>) {
+        self.ledger = ledger;
     }
 
     /// The world as it stands.
@@ -163,6 +183,7 @@ where
             ledger.substitute(index, commands);
         }
         self.put_in = missing.commands;
+        self.put_in_verdict = verdict;
         self.finish_step()?;
         Ok(true)
     }
@@ -198,10 +219,7 @@ where
     /// wait for the coordination of the step), nothing is kept, or the run is over.
     pub fn handover(&self, role: Role, index: u32) -> Option<Handover> {
         let ledger = self.ledger.as_ref()?;
-        let mut handover = match role {
-            Role::Coordinator => ledger.to_coordinator(),
-            _ => ledger.to_controller(index as usize),
-        };
+        let mut handover = ledger.handover(role, index as usize);
         handover.step = self.world.step();
         match (self.phase, role) {
             (Phase::Finished, _) => return None,
@@ -260,6 +278,10 @@ where
         let loan =
             self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
         self.world.seal(loan.records());
+        if self.observer.is_some() {
+            self.published.clear();
+            self.published.extend_from_slice(loan.records());
+        }
         if let Some(ledger) = &mut self.ledger {
             ledger.begin(loan.records(), masks.acting != 0);
         }
@@ -267,6 +289,9 @@ where
         loan.send()?;
         self.header = FrameHeader { record_count: count as u32, ..header };
         self.suspect = None;
+        if finished {
+            self.show(0)?;
+        }
         self.phase = if finished {
             Phase::Finished
         } else {
@@ -298,8 +323,39 @@ where
         }
     }
 
+    /// Shows the step to the observer, with the commands of so many controllers.
+    fn show(&mut self, controllers: usize) -> Result<(), LockstepError> {
+        let (Some(observer), Some(ledger)) = (&mut self.observer, &self.ledger) else { return Ok(()) };
+        let zones = self.world.scenario().network.zones.len() as u32;
+        let count = self.coordinators.len() as u32;
+        let process_of = |zone| (0..count).find(|&i| zones_of(zones, i, count).contains(&zone));
+        let between = |s: &&ZoneSummary| process_of(s.from_zone) != process_of(s.to_zone);
+        let summaries: Vec<ZoneSummary> = ledger.summaries().iter().filter(between).copied().collect();
+        let coordination: Vec<&[Assignment]> = ledger.coordination().iter().map(|(_, a)| &a[..]).collect();
+        let commands: Vec<CommandPart<'_>> = self.controllers[..controllers]
+            .iter()
+            .enumerate()
+            .map(|(index, seat)| CommandPart {
+                generation: seat.generation,
+                records: ledger.commands(index).0,
+            })
+            .collect();
+        observer.observe(&StepFrames {
+            header: self.header,
+            state: &self.published,
+            summaries: &[&summaries],
+            coordination: &coordination,
+            commands: &commands,
+            misses: if controllers == 0 { 0 } else { self.put_in },
+            policy: if self.put_in == 0 { POLICY_NONE } else { u32::from(self.put_in_verdict) },
+            state_hash: self.world.state_hash(),
+        })?;
+        Ok(())
+    }
+
     fn finish_step(&mut self) -> Result<(), LockstepError> {
         let step = self.world.step();
+        self.show(self.controllers.len())?;
         self.world.advance().map_err(|vehicles| LockstepError::Uncommanded { step, vehicles })?;
         if let Some(ledger) = &mut self.ledger {
             ledger.end();

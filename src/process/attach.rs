@@ -207,8 +207,10 @@ pub(super) struct Reception {
     /// Name hash, and the bytes behind the reply, of each plug-in.
     plugins: Vec<(u64, Vec<u8>)>,
     plugin_names: String,
-    /// The step a newcomer begins with, once the run is under way.
-    pub(super) under_way: Option<u64>,
+    /// The step a participant begins with.
+    pub(super) first_step: u64,
+    /// Whether the run has begun.
+    pub(super) under_way: bool,
     /// Requests that cannot be answered yet.
     pending: Vec<AttachRequest>,
     /// Why somebody was refused last.
@@ -269,7 +271,8 @@ impl Reception {
             desk: space.create_attach_desk((coordinators + controllers) as usize, longest)?,
             pool: drivers.pool() as usize,
             plugins,
-            under_way: None,
+            first_step: 0,
+            under_way: false,
             pending: Vec::new(),
             last_refusal: None,
             plugin_names: scenario.plugins.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", "),
@@ -309,7 +312,7 @@ impl Reception {
             run_id: self.run_id,
             schema_hash: schema_hash(),
             scenario_hash: self.scenario_hash,
-            first_step: self.under_way.unwrap_or(0),
+            first_step: self.first_step,
             status,
             world_process_id: std::process::id(),
             generation,
@@ -381,15 +384,14 @@ impl Reception {
             }
         });
         let Some(at) = place else {
-            let status =
-                if self.under_way.is_some() { frames::ATTACH_UNDER_WAY } else { frames::ATTACH_NO_ROOM };
+            let status = if self.under_way { frames::ATTACH_UNDER_WAY } else { frames::ATTACH_NO_ROOM };
             return (status, 0, 0);
         };
         let place = &mut places[at];
         if is_newcomer {
             let AttachRequest { instance, process_id, .. } = *request;
             place.occupant = Some(Occupant { instance, process_id, ready: false });
-            place.generation += u32::from(self.under_way.is_some());
+            place.generation += u32::from(self.under_way);
         }
         if let Some(occupant) = place.occupant.as_mut().filter(|_| request.phase != frames::ATTACH_JOIN) {
             occupant.ready = true;

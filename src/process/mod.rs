@@ -1,6 +1,7 @@
 //! The processes of a run: thin shells that give the pure roles a clock, signals and a transport.
 
 mod attach;
+mod observe;
 mod pace;
 mod participant;
 mod peers;
@@ -13,6 +14,7 @@ mod wait;
 mod world;
 
 pub use attach::{Attachment, Joining};
+pub use observe::Observation;
 pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
@@ -23,7 +25,8 @@ pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
     LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, WorldOptions, check_cores,
-    expected_vehicles, new_histogram, run_in_process, run_in_process_observed, run_world,
+    expected_vehicles, first_missing_step, new_histogram, new_run_id, run_in_process,
+    run_in_process_observed, run_on_in_process, run_world,
 };
 
 use crate::lockstep::{Awaited, LockstepError};
@@ -82,6 +85,15 @@ pub enum ProcessError {
         missing: String,
         /// Program that would start one.
         command: &'static str,
+        /// How long was waited.
+        seconds: f64,
+    },
+    /// A recording to go on from cannot be replayed.
+    #[error(transparent)]
+    Resume(#[from] crate::record::ReplayError),
+    /// Nobody came to record a run that is to be recorded.
+    #[error("waited {seconds} s for whoever is to record the run")]
+    NotObserved {
         /// How long was waited.
         seconds: f64,
     },

@@ -1,6 +1,7 @@
 //! The world process.
 
 use super::attach::{Readiness, Reception};
+use super::observe::{self, ObservedSteps};
 use super::pace::Pacer;
 use super::placement::number_of_cores;
 use super::{
@@ -8,8 +9,8 @@ use super::{
     Waiter,
 };
 use crate::lockstep::in_process::InProcess;
-use crate::lockstep::{Awaited, Progress, RefusedFrames, Seat, WorldDriver, WorldPorts};
-use crate::record::StepFrames;
+use crate::lockstep::{Awaited, Handover, Ledger, Progress, RefusedFrames, Seat, WorldDriver, WorldPorts};
+use crate::record::{FileSource, Reader, ReplayError, StepFrames, replay_world};
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
 use crate::transport::iox::{BellRope, BellService, RunName, RunSpace, Service, ServiceLimits, SpaceError};
@@ -41,12 +42,16 @@ pub struct WorldOptions {
     pub replace: bool,
     /// When steps begin, and what becomes of late ones.
     pub timing: Timing,
+    /// Whether the run is looked on; it begins once somebody does.
+    pub observed: bool,
+    /// The run's id, where it has been chosen already.
+    pub run_id: Option<u64>,
 }
 
 impl WorldOptions {
     /// Whether the world keeps what others need who take a place, or catch up.
     fn keeps(&self) -> bool {
-        self.replace || self.timing.on_miss.verdict().is_some()
+        self.replace || self.observed || self.timing.on_miss.verdict().is_some()
     }
 }
 
@@ -242,42 +247,82 @@ pub fn check_cores(processes: usize) -> Result<(), ProcessError> {
     if processes > cores { Err(ProcessError::TooFewCores { processes, cores }) } else { Ok(()) }
 }
 
+/// The first step a recording does not have: where an interrupted run goes on.
+pub fn first_missing_step(reader: &Reader<FileSource>) -> u64 {
+    let sound = reader.steps().map_while(Result::ok);
+    let in_order = (0..).zip(sound).take_while(|(expected, step)| step.header.step == *expected);
+    in_order.count() as u64
+}
+
+/// An id nobody else has.
+pub fn new_run_id() -> u64 {
+    let mut id = [0u8; 8];
+    if rustix::rand::getrandom(&mut id, rustix::rand::GetRandomFlags::NONBLOCK).is_err() {
+        id = u64::from(std::process::id()).to_le_bytes();
+    }
+    u64::from_le_bytes(id)
+}
+
 /// Runs the world of a multi-process run to its end; `progress` is called now and then.
 pub fn run_world(
     scenario: &Arc<Scenario>,
     options: &WorldOptions,
+    resume: Option<&Reader<FileSource>>,
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
+    // First of all: it may take a while, and may fail.
+    let world = match resume {
+        Some(reader) => replay_world(reader, first_missing_step(reader))?,
+        None => World::new(scenario.clone(), options.coordinators),
+    };
+    let first_step = world.step();
+    let mut ledger =
+        (options.keeps() || resume.is_some()).then(|| Ledger::new(scenario, options.controllers));
+    for step in resume.iter().flat_map(|reader| reader.steps()) {
+        let step = step.map_err(ReplayError::from)?;
+        if step.header.step >= first_step {
+            break;
+        }
+        ledger.iter_mut().for_each(|ledger| ledger.relive(&step));
+    }
     let WorldOptions { coordinators, controllers, wait, .. } = *options;
     if wait == WaitMode::Spin {
         check_cores(1 + (coordinators + controllers) as usize)?;
     }
     let space = RunSpace::enter(&options.run)?;
-    let mut run_id = [0u8; 8];
-    if rustix::rand::getrandom(&mut run_id, rustix::rand::GetRandomFlags::NONBLOCK).is_err() {
-        run_id = u64::from(std::process::id()).to_le_bytes();
-    }
-    let run_id = u64::from_le_bytes(run_id);
+    let run_id = options.run_id.unwrap_or_else(new_run_id);
     let active = |error| match error {
         SpaceError::Exists { .. } => ProcessError::AlreadyActive { run: options.run.to_string() },
         other => other.into(),
     };
     // The desk last: once it exists, everything else does.
     let services =
-        Services::create(&space, scenario, (coordinators, controllers), options.keeps()).map_err(active)?;
+        Services::create(&space, scenario, (coordinators, controllers), ledger.is_some()).map_err(active)?;
+    let observed = match options.observed {
+        true => Some(observe::create(&space, expected_vehicles(scenario), scenario).map_err(active)?),
+        false => None,
+    };
     let _bells = create_bells(&space, wait, coordinators, controllers)?;
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
     let bell = rung.then(|| space.bell(frames::BELL_WORLD)).flatten();
     let mut reception =
         Reception::open(&space, scenario, run_id, (coordinators, controllers), wait).map_err(active)?;
-    receive_all(&mut reception, options, stop)?;
+    reception.first_step = first_step;
+    let handed = |role, index| {
+        let ledger = ledger.as_ref().filter(|_| resume.is_some())?;
+        Some(Handover { step: first_step, ..ledger.handover(role, index) })
+    };
+    receive_all(&mut reception, &handed, observed.as_ref(), options, stop)?;
     // Bells are hung up by now, so that the ropes hold.
     let ports = services.world_ports(&space, scenario, wait)?;
 
-    let world = World::new(scenario.clone(), coordinators);
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
+    driver.keep(ledger);
+    if let Some(steps) = observed {
+        driver.observe(Box::new(steps));
+    }
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
     let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
     for Peer { role, index, process_id } in reception.peers().0 {
@@ -294,7 +339,7 @@ pub fn run_world(
     let mut history = History::default();
     let is_paced = options.timing.pace == Pace::Realtime;
     let mut meter = StepMeter::start();
-    let mut step = 0;
+    let mut step = first_step;
     loop {
         if driver.is_between_steps() {
             house.begin_step(&mut driver, &mut waiter, stop)?;
@@ -451,7 +496,7 @@ impl House {
         A: Inbox<Assignment>,
     {
         let House { reception, arrived, gone, .. } = self;
-        reception.under_way = Some(driver.world().step());
+        (reception.under_way, reception.first_step) = (true, driver.world().step());
         let before = arrived.len();
         reception.serve(&mut |role, index, seat| {
             driver.seat(role, index, seat);
@@ -470,7 +515,7 @@ impl House {
 
     /// The replacements of a step that took so long.
     fn step_done(&mut self, ns: u64) -> impl Iterator<Item = Replacement> + '_ {
-        let step = self.reception.under_way.unwrap_or(0);
+        let step = self.reception.first_step;
         let step_ms = ns as f64 / 1e6;
         self.arrived.drain(..).filter(|(_, generation)| *generation > 0).map(move |(peer, generation)| {
             Replacement { participant: peer.to_string(), generation, step, step_ms }
@@ -503,6 +548,15 @@ pub fn run_in_process_observed(
     drive(&mut run, stop, progress, observe)
 }
 
+/// Runs one that goes on from a recording to its end.
+pub fn run_on_in_process(
+    mut run: InProcess,
+    stop: &StopFlag,
+    progress: impl FnMut(&World),
+) -> Result<Outcome, ProcessError> {
+    drive(&mut run, stop, progress, |_| {})
+}
+
 fn drive(
     run: &mut InProcess,
     stop: &StopFlag,
@@ -531,17 +585,29 @@ fn drive(
 /// Waits until all participants are ready.
 fn receive_all(
     reception: &mut Reception,
+    handed: &dyn Fn(Role, usize) -> Option<Handover>,
+    observed: Option<&ObservedSteps>,
     options: &WorldOptions,
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
     let deadline = Instant::now() + options.attach_timeout;
     loop {
-        reception.serve(&mut |_, _, _| Readiness::Begin)?;
-        let Some((role, index)) = reception.first_missing() else { return Ok(()) };
+        reception.serve(&mut |role, index, _| match handed(role, index as usize) {
+            Some(handover) => Readiness::Now(Box::new(handover)),
+            None => Readiness::Begin,
+        })?;
+        let missing = reception.first_missing();
+        let is_looked_on = observed.is_none_or(|steps| steps.0.has_reader());
+        if missing.is_none() && is_looked_on {
+            return Ok(());
+        }
         if stop.is_set() {
             return Err(ProcessError::Interrupted { step: None });
         }
         if Instant::now() >= deadline {
+            let Some((role, index)) = missing else {
+                return Err(ProcessError::NotObserved { seconds: options.attach_timeout.as_secs_f64() });
+            };
             return Err(ProcessError::Missing {
                 run: options.run.to_string(),
                 missing: reception.name_of(role, index),

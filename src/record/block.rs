@@ -237,6 +237,11 @@ pub struct Commands {
 }
 
 impl Step {
+    /// The number of the step a block is of, if it is one.
+    pub fn number_in(block: &[u8]) -> Option<u64> {
+        BlockHead::of(block).ok().map(|head| head.header.step)
+    }
+
     /// The step of a block.
     pub fn decode(block: &[u8]) -> Result<Step, BlockFault> {
         let head = BlockHead::of(block)?;

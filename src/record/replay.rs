@@ -12,8 +12,9 @@ use crate::scenario::share::zones_of;
 use crate::scenario::{Drivers, Scenario};
 use crate::world::World;
 use ipc_schemas::{
-    Assignment, FLAG_END_OF_RUN, NO_ZONE, STATE_LEFT, VehicleCommand, VehicleState, ZoneSummary,
+    Assignment, FLAG_END_OF_RUN, FLAG_MISSED, NO_ZONE, STATE_LEFT, VehicleCommand, VehicleState, ZoneSummary,
 };
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// Why a world cannot be brought to a step.
@@ -207,6 +208,8 @@ struct WorldReplay {
     /// With all frames that came out right in it.
     state_hash: u64,
     finished: bool,
+    /// Whether commands were put in in the step before.
+    missed: bool,
 }
 
 impl WorldReplay {
@@ -214,7 +217,7 @@ impl WorldReplay {
         let metadata = reader.metadata();
         let mut world = World::new(reader.scenario().clone(), metadata.coordinators);
         world.share_out(metadata.controllers);
-        WorldReplay { world, state_hash: 0, finished: false }
+        WorldReplay { world, state_hash: 0, finished: false, missed: false }
     }
 
     /// Compares the world with the recorded state, then gives it the recorded commands.
@@ -228,6 +231,7 @@ impl WorldReplay {
         own.header.coordinators_acting = masks.acting;
         own.header.coordinators_summarised = masks.summarised;
         own.header.flags = if finished { FLAG_END_OF_RUN } else { 0 };
+        own.header.flags |= if self.missed { FLAG_MISSED } else { 0 };
         world.seal(&own.state);
         own.state_hash = world.state_hash();
         if let Some(difference) = first_difference(&own, step, Rules { same_processes: true }) {
@@ -235,6 +239,7 @@ impl WorldReplay {
         }
         self.state_hash = own.state_hash;
         self.finished = finished;
+        self.missed = step.misses != 0;
         if finished {
             return Ok(());
         }
@@ -297,6 +302,10 @@ impl CoordinatorReplay {
 struct ControllerReplay {
     role: ControllerPool,
     index: usize,
+    /// What a controller takes over after a step in which commands were put in: those of that step, and the
+    /// assignments in force by zone.
+    before: Vec<VehicleCommand>,
+    in_force: BTreeMap<u32, Vec<Assignment>>,
 }
 
 fn controllers<S: Source>(reader: &Reader<S>) -> Vec<(ControllerReplay, Tally)> {
@@ -307,7 +316,9 @@ fn controllers<S: Source>(reader: &Reader<S>) -> Vec<(ControllerReplay, Tally)> 
         let role = ControllerPool::new(scenario.clone(), zones_of(all_zones, index, pool));
         let mut tally = Tally::new(format!("controller {index}"));
         tally.why = "it did not answer in time";
-        (ControllerReplay { role, index: index as usize }, tally)
+        let role =
+            ControllerReplay { role, index: index as usize, before: Vec::new(), in_force: BTreeMap::new() };
+        (role, tally)
     };
     (0..pool).map(role).collect()
 }
@@ -315,6 +326,17 @@ fn controllers<S: Source>(reader: &Reader<S>) -> Vec<(ControllerReplay, Tally)> 
 impl ControllerReplay {
     fn take(&mut self, step: &Step, skipped: &mut u64) -> Result<bool, String> {
         let number = step.header.step;
+        if step.header.flags & FLAG_MISSED != 0 {
+            let in_force: Vec<Assignment> = self.in_force.values().flatten().copied().collect();
+            self.role
+                .restore(&step.state, &self.before, &in_force)
+                .map_err(|fault| format!("step {number}: {fault}"))?;
+        }
+        for group in step.coordination.chunk_by(|a, b| a.zone == b.zone) {
+            self.in_force.insert(group[0].zone, group.to_vec());
+        }
+        self.before.clear();
+        self.before.extend(step.commands.iter().flat_map(|part| &part.records));
         self.role
             .coordinate(&step.state, &step.coordination)
             .map_err(|fault| format!("step {number}: {fault}"))?;

@@ -108,6 +108,19 @@ pub fn load_given(
     load_text("<given>", text, TraceBase::Given(traces), overrides, seed)
 }
 
+/// Loads a recorded scenario's text again, with what was changed in it then and what is to be changed now.
+/// Traces are embedded ones, or relative to the current directory.
+pub fn load_recorded(
+    text: &str,
+    recorded: &[String],
+    overrides: &[Override],
+    seed: u64,
+) -> Result<Scenario, ScenarioError> {
+    let recorded = recorded.iter().map(|set| set.parse()).collect::<Result<Vec<Override>, _>>()?;
+    let all = [&recorded, overrides].concat();
+    load_text("<recording>", text, TraceBase::Embedded, &all, Some(seed))
+}
+
 fn load_text(
     file: &str,
     text: &str,

@@ -20,7 +20,7 @@ pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use encode::{DecodeError, decode, encode, scenario_hash};
 pub use load::{
     DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
-    text_of,
+    load_recorded, text_of,
 };
 pub use network::{Approach, Exit, Network, Road, Source, Zone, ZoneId};
 pub use params::{

@@ -9,14 +9,15 @@ use std::collections::{BinaryHeap, VecDeque};
 /// All entry roads.
 #[derive(Debug)]
 pub(super) struct Gates {
-    streams: Vec<ArrivalStream>,
-    pending: Vec<Option<Arrival>>,
+    pub streams: Vec<ArrivalStream>,
+    /// The next arrival of each road.
+    pub pending: Vec<Option<Arrival>>,
     /// Roads by their next arrival: instant (as ordered bits), then road order.
-    next: BinaryHeap<Reverse<(u64, usize)>>,
+    pub next: BinaryHeap<Reverse<(u64, usize)>>,
     pub waiting: Vec<VecDeque<Waiting>>,
     /// Where somebody waits, by zone.
     pub queues: Vec<Queue>,
-    left_to_generate: u32,
+    pub left_to_generate: u32,
     pub held: u32,
 }
 

@@ -145,6 +145,13 @@ impl World {
     /// Shares the approaches out over the built-in pool and the plug-ins, `controllers` processes in all.
     /// Without it, one process drives everything that no plug-in drives.
     pub fn share_out(&mut self, controllers: u32) {
+        // A world that goes on from a recording keeps what it has counted.
+        if self.gateway.drivers.count() != controllers {
+            self.rebuild_gateway(controllers);
+        }
+    }
+
+    pub(super) fn rebuild_gateway(&mut self, controllers: u32) {
         self.gateway = Gateway::new(&self.scenario, controllers);
     }
 

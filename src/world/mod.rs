@@ -1,6 +1,7 @@
 //! The world role: arrivals, vehicle states, integration, metrics. Commands in, states out.
 
 mod car;
+mod change;
 mod gate;
 mod gateway;
 mod integrate;
@@ -8,6 +9,7 @@ mod link;
 mod metrics;
 mod role;
 
+pub use change::ChangeError;
 pub use gateway::CommandFault;
 pub use metrics::{CompletedVisit, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
 pub use role::{CoordinatorMasks, World};

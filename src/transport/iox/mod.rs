@@ -1,11 +1,13 @@
 //! Frames between processes: iceoryx2 publish/subscribe over shared memory.
 
 mod bell;
+mod blocks;
 mod leftovers;
 mod ports;
 mod space;
 
 pub use bell::{Bell, BellRope, BellService};
+pub use blocks::{Block, BlockInbox, BlockOutbox};
 pub use leftovers::{Condition, Leftover, clean};
 pub use ports::{IoxFrame, IoxInbox, IoxLoan, IoxOutbox};
 pub use space::{

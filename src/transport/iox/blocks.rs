@@ -1,0 +1,120 @@
+//! Blocks of bytes for whoever looks on: a service that overflows, so that nobody waits for a reader.
+
+use super::space::{RunSpace, SpaceError, failed, service_name};
+use crate::transport::TransportError;
+use iceoryx2::port::publisher::Publisher;
+use iceoryx2::port::subscriber::Subscriber;
+use iceoryx2::prelude::AllocationStrategy;
+use iceoryx2::sample::Sample;
+use iceoryx2::service::ipc;
+use iceoryx2::service::port_factory::PortFactory as _;
+use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+
+/// The sending end, which also keeps the service.
+#[derive(Debug)]
+pub struct BlockOutbox {
+    service: String,
+    publisher: Publisher<ipc::Service, [u8], ()>,
+    factory: PortFactory<ipc::Service, [u8], ()>,
+}
+
+impl BlockOutbox {
+    /// Whether somebody has opened the other end.
+    pub fn has_reader(&self) -> bool {
+        self.factory.dynamic_config().number_of_subscribers() > 0
+    }
+
+    /// Sends a block of that many bytes, which `fill` writes piece by piece where it will be read.
+    ///
+    /// # Panics
+    /// When `fill` writes another number of bytes.
+    pub fn send(
+        &self,
+        length: usize,
+        fill: impl FnOnce(&mut dyn FnMut(&[u8])),
+    ) -> Result<(), TransportError> {
+        let failed = |reason: String| TransportError::Failed { service: self.service.clone(), reason };
+        let mut sample = self.publisher.loan_slice(length).map_err(|e| failed(format!("{e:?}")))?;
+        let mut rest = sample.payload_mut();
+        fill(&mut |piece| {
+            let (here, after) = std::mem::take(&mut rest).split_at_mut(piece.len());
+            here.copy_from_slice(piece);
+            rest = after;
+        });
+        assert!(rest.is_empty(), "a block is as long as was said");
+        sample.send().map_err(|e| failed(format!("{e:?}")))?;
+        Ok(())
+    }
+}
+
+/// The receiving end.
+#[derive(Debug)]
+pub struct BlockInbox {
+    service: String,
+    subscriber: Subscriber<ipc::Service, [u8], ()>,
+}
+
+/// A block where it lies in shared memory.
+#[derive(Debug)]
+pub struct Block(Sample<ipc::Service, [u8], ()>);
+
+impl Block {
+    /// Its bytes.
+    pub fn bytes(&self) -> &[u8] {
+        self.0.payload()
+    }
+}
+
+impl BlockInbox {
+    /// The next block, if there is one. Blocks that came faster than they were taken are gone.
+    pub fn receive(&self) -> Result<Option<Block>, TransportError> {
+        match self.subscriber.receive() {
+            Ok(sample) => Ok(sample.map(Block)),
+            Err(e) => Err(TransportError::Failed { service: self.service.clone(), reason: format!("{e:?}") }),
+        }
+    }
+}
+
+impl RunSpace {
+    /// Creates a service for blocks of about so many bytes, as many of which may wait to be read.
+    pub fn create_blocks(
+        &self,
+        name: &str,
+        expected: usize,
+        waiting: usize,
+    ) -> Result<BlockOutbox, SpaceError> {
+        let factory = self
+            .node()
+            .service_builder(&service_name(name)?)
+            .publish_subscribe::<[u8]>()
+            .enable_safe_overflow(true)
+            .subscriber_max_buffer_size(waiting)
+            .subscriber_max_borrowed_samples(2)
+            .max_publishers(1)
+            .max_subscribers(1)
+            .max_nodes(3)
+            .create()
+            .map_err(|e| failed(&format!("create service {name}"), &e))?;
+        let publisher = factory
+            .publisher_builder()
+            .initial_max_slice_len(expected)
+            .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .create()
+            .map_err(|e| failed(&format!("create a publisher of {name}"), &e))?;
+        Ok(BlockOutbox { service: name.to_owned(), publisher, factory })
+    }
+
+    /// Opens the receiving end; `None` while there is no such service.
+    pub fn open_blocks(&self, name: &str) -> Result<Option<BlockInbox>, SpaceError> {
+        let Ok(factory) =
+            self.node().service_builder(&service_name(name)?).publish_subscribe::<[u8]>().open()
+        else {
+            return Ok(None);
+        };
+        let subscriber = factory
+            .subscriber_builder()
+            .create()
+            .map_err(|e| failed(&format!("create a subscriber of {name}"), &e))?;
+        Ok(Some(BlockInbox { service: name.to_owned(), subscriber }))
+    }
+}
