@@ -26,7 +26,7 @@ sancov=(
 triple=$(rustc -vV | sed -n 's/^host: //p')
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-../target/fuzz}
 RUSTFLAGS="${sancov[*]} --cfg fuzzing -Cdebug-assertions -Coverflow-checks" \
-    cargo build --release --target "$triple" --bins
+    cargo build --locked --release --target "$triple" --bins
 
 mkdir -p artifacts
 for target in "${targets[@]}"; do
