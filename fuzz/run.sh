@@ -26,19 +26,20 @@ sancov=(
 triple=$(rustc -vV | sed -n 's/^host: //p')
 export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-../target/fuzz}
 RUSTFLAGS="${sancov[*]} --cfg fuzzing -Cdebug-assertions -Coverflow-checks" \
-    cargo build --release --target "$triple" --bins
+    cargo build --locked --release --target "$triple" --bins
 
 mkdir -p artifacts
 for target in "${targets[@]}"; do
     printf '\n--- %s, %s s\n' "$target" "$seconds"
     mkdir -p "found/$target" "corpus/$target"
+    log=artifacts/$target.log
+    status=0
     "$CARGO_TARGET_DIR/$triple/release/$target" "found/$target" "corpus/$target" \
         -max_total_time="$seconds" -timeout=20 -rss_limit_mb=2048 -print_final_stats=1 -verbosity=0 \
-        -artifact_prefix="artifacts/$target-" -max_len=20000 2>&1 |
-        tee "artifacts/$target.log" | grep -E '^stat::|^==|ERROR|panicked|SUMMARY|Test unit' || true
-    # The pipe's status is the fuzzer's.
-    if ((${PIPESTATUS[0]} != 0)); then
-        printf '%s: found something, see fuzz/artifacts/%s.log\n' "$target" "$target"
+        -artifact_prefix="artifacts/$target-" -max_len=20000 >"$log" 2>&1 || status=$?
+    grep -E '^stat::|ERROR|panicked|SUMMARY|Test unit' "$log" || true
+    if ((status != 0)); then
+        printf '%s: found something, see fuzz/%s\n' "$target" "$log"
         exit 1
     fi
     if [[ -n ${MERGE:-} ]]; then

@@ -243,6 +243,27 @@ fn replay_names_the_role_that_did_otherwise() {
     assert_eq!(result.roles[4].inputs_only.map(|(steps, _)| steps), Some(1));
 }
 
+#[test]
+fn states_no_world_sends_end_a_replay_and_nothing_worse() {
+    let run = small();
+    let changes: [fn(&mut Step); 6] = [
+        |s| s.state[0].entry_speed_mps = 1e300,
+        |s| s.state[0].x_m = f64::NAN,
+        |s| s.state[0].path = 9,
+        |s| s.state[0].zone = 77,
+        |s| s.state.reverse(),
+        |s| s.header.time_ns = u64::MAX,
+    ];
+    let busy = |s: &&Step| s.state.len() > 2 && s.state[0].zone != s.state.last().unwrap().zone;
+    let at = run.steps.iter().find(busy).unwrap().header.step as usize;
+    for (i, change) in changes.into_iter().enumerate() {
+        let result = replay(&run.with(|steps| change(&mut steps[at])).reader(), |_| {});
+        // No role goes on from there.
+        assert!(result.roles.iter().all(|r| r.difference.is_some()), "change {i}: {result:?}");
+        assert_eq!(result.roles[0].steps, at as u64, "change {i}");
+    }
+}
+
 /// Checks that a reader hands out nothing but what was written, and returns how many steps it did hand out
 /// and what it found wrong.
 fn honest(run: &Run, bytes: &[u8], what: &str) -> Option<(u64, Vec<Flaw>)> {

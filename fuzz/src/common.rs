@@ -9,7 +9,7 @@ use std::sync::{Arc, LazyLock};
 
 /// The run: its metadata and steps.
 pub static RUN: LazyLock<(Metadata, Vec<Step>)> = LazyLock::new(|| {
-    let sets: Vec<Override> = ["end.time_s=18", "end.vehicles=8"]
+    let sets: Vec<Override> = ["end.time_s=10", "end.vehicles=6"]
         .iter()
         .map(|set| set.parse().expect("the set is well formed"))
         .collect();

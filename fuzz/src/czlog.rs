@@ -67,8 +67,7 @@ fn try_everything(bytes: &[u8]) {
         assert!(until.is_none_or(|until| replay_world(&reader, until).is_ok()));
     }
     assert!(show_everything(&reader) > 0);
-    let own = common::reader();
-    assert_eq!(compare(&reader, &own).steps, compare(&own, &reader).steps);
-    let with_itself = compare(&reader, &reader);
-    assert!(with_itself.difference.is_none());
+    // Against ours, up to the first difference; a recording never differs from itself.
+    assert!(compare(&reader, &common::reader()).steps <= RUN.1.len() as u64);
+    assert!(compare(&reader, &reader).difference.is_none());
 }

@@ -124,7 +124,8 @@ pub fn replay<S: Source>(reader: &Reader<S>, mut progress: impl FnMut(u64)) -> R
     let mut coordinators = coordinators(reader);
     let mut controllers = controllers(reader);
     let mut before: Vec<ZoneSummary> = Vec::new();
-    let (mut steps, mut stopped) = (0, None);
+    let (mut steps, mut stopped) = (0_u64, None);
+    let dt_ns = reader.metadata().dt_ns;
     for step in reader.steps() {
         let step = match step {
             Ok(step) if step.header.step == steps => step,
@@ -145,6 +146,8 @@ pub fn replay<S: Source>(reader: &Reader<S>, mut progress: impl FnMut(u64)) -> R
         }
         // The others index by what a state frame says; one that no world sends ends them as well.
         let sound = sound_states(reader.scenario(), &step.state);
+        let sound =
+            sound.and(if step.header.time_ns == steps.saturating_mul(dt_ns) { Ok(()) } else { Err(0) });
         let is_last = step.header.flags & FLAG_END_OF_RUN != 0;
         for (role, tally) in &mut coordinators {
             tally.step(sound, |_| if is_last { Ok(false) } else { role.take(&step, &before) });
@@ -369,27 +372,29 @@ fn difference(own: &Step, recorded: &Step) -> Option<String> {
     Some(format!("{difference} (replayed / recorded)"))
 }
 
+/// Beyond these no vehicle gets in a scenario that a recording may have.
+const MAX_M: f64 = 1e6;
+const MAX_MPS: f64 = 1e4;
+const MAX_S: f64 = 1e9;
+
 /// Whether a recorded state frame is one that roles can be given: zones in order, paths that exist, numbers
-/// that are numbers; else the first vehicle of which it is not so.
+/// that a vehicle can have; else the first vehicle of which it is not so.
 fn sound_states(scenario: &Scenario, states: &[VehicleState]) -> Result<(), u32> {
     let mut last = 0;
     for (i, state) in states.iter().enumerate() {
         let is_first = i == 0 || states[i - 1].zone != state.zone;
-        let numbers = [
-            state.x_m,
-            state.v_mps,
-            state.u_mps2,
-            state.entry_time_s,
-            state.entry_speed_mps,
-            state.planned_exit_time_s,
-            state.planned_exit_speed_mps,
-        ];
+        let within = |value: f64, least: f64, most: f64| value >= least && value <= most;
+        let numbers = within(state.x_m, -MAX_M, MAX_M)
+            && within(state.v_mps, 0.0, MAX_MPS)
+            && within(state.u_mps2, -MAX_MPS, MAX_MPS)
+            && within(state.entry_time_s, 0.0, MAX_S)
+            && within(state.entry_speed_mps, 0.0, MAX_MPS);
         let place = scenario.network.zones.get(state.zone as usize);
         let on_path = place.is_some_and(|zone| (state.path as usize) < zone.approaches.len());
         let sound = state.zone >= last
             && (on_path || state.zone == NO_ZONE)
             && (is_first || state.flags & STATE_LEFT == 0)
-            && numbers.iter().all(|n| n.is_finite());
+            && numbers;
         if !sound {
             return Err(state.vehicle);
         }
