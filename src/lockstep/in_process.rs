@@ -84,12 +84,9 @@ impl InProcess {
             world.change(scenario)?;
         }
         let mut ledger = Ledger::<MemoryFrame<VehicleCommand>>::new(world.scenario(), controllers);
-        for recorded in reader.steps() {
-            let recorded = recorded.map_err(ReplayError::from)?;
-            if recorded.header.step >= step {
-                break;
-            }
-            ledger.relive(&recorded);
+        // Behind these the file may be cut off.
+        for recorded in reader.steps().take(step as usize) {
+            ledger.relive(&recorded.map_err(ReplayError::from)?);
         }
         let mut run = InProcess::build(world, coordinators, controllers, false);
         for (index, coordinator) in run.coordinators.iter_mut().enumerate() {

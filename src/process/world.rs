@@ -279,11 +279,9 @@ pub fn run_world(
     let first_step = world.step();
     let mut ledger =
         (options.keeps() || resume.is_some()).then(|| Ledger::new(scenario, options.controllers));
-    for step in resume.iter().flat_map(|reader| reader.steps()) {
+    // Behind these the file may be cut off.
+    for step in resume.iter().flat_map(|reader| reader.steps().take(first_step as usize)) {
         let step = step.map_err(ReplayError::from)?;
-        if step.header.step >= first_step {
-            break;
-        }
         ledger.iter_mut().for_each(|ledger| ledger.relive(&step));
     }
     let WorldOptions { coordinators, controllers, wait, .. } = *options;
