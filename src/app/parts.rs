@@ -30,12 +30,11 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         peer_timeout: args.wait.peer_timeout,
         wait: args.wait_mode,
     };
-    let hot_processes = args.wait_mode.hot_processes(options.coordinators, options.controllers);
     let report = report_to(args.supervised, &args.wait);
-    settling(&args.wait, &*report).settle(Role::World, 0, args.wait_mode, hot_processes);
+    let settling = settling(&args.wait, &*report);
     if args.supervised.is_some() {
         let mut last = Instant::now();
-        let outcome = run_world(&scenario, &options, &stop, |world| {
+        let outcome = run_world(&scenario, &options, &settling, &stop, |world| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
                 say(&WorldLine::progress(world));
@@ -44,7 +43,7 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         say(&WorldLine::Outcome(Box::new(outcome)));
         return Ok(());
     }
-    let outcome = run_world(&scenario, &options, &stop, |_: &World| {})?;
+    let outcome = run_world(&scenario, &options, &settling, &stop, |_: &World| {})?;
     let processes = 1 + options.coordinators + options.controllers;
     Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome).deliver(args.json.as_deref())
 }

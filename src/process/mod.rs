@@ -15,7 +15,7 @@ pub use attach::{Attachment, Joining};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
 pub use placement::{Affinity, Placement, place, unplaced};
-pub use realtime::{Settled, Settling};
+pub use realtime::{Held, Settled, Settling};
 pub use run_spec::plugin_bytes;
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};

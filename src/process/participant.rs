@@ -31,7 +31,7 @@ pub fn run_coordinator(
     let own = |prefix: &str| format!("{prefix}{index}");
     let wait = WaitMode::from_code(attachment.reply.waiting);
     let bell = wait.has_bell(Role::Coordinator).then(|| space.bell(&own(frames::BELL_COORDINATOR_PREFIX)));
-    settling.settle(Role::Coordinator, index, wait, wait.hot_processes(coordinators, controllers));
+    let held = settling.settle(Role::Coordinator, index, wait, wait.hot_processes(coordinators, controllers));
     let neighbours = (0..coordinators)
         .filter(|n| mask >> n & 1 == 1)
         .map(|n| {
@@ -56,6 +56,8 @@ pub fn run_coordinator(
     let mut driver = CoordinatorDriver::new(role, ports, identity, controllers);
     attachment.ready(stop)?;
     let hot_processes = 1 + controllers as usize;
+    // Declared last, so let go first.
+    let _held = held;
     let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
     Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world()).drive(|| driver.advance())
 }
@@ -74,7 +76,7 @@ pub fn run_controller(
     let wait = WaitMode::from_code(attachment.reply.waiting);
     let own_bell = || space.bell(&format!("{}{index}", frames::BELL_CONTROLLER_PREFIX));
     let bell = wait.has_bell(Role::Controller).then(own_bell).flatten();
-    settling.settle(Role::Controller, index, wait, wait.hot_processes(coordinators, controllers));
+    let held = settling.settle(Role::Controller, index, wait, wait.hot_processes(coordinators, controllers));
     let scenario = &attachment.scenario;
     // Plug-ins come behind the processes of the pool.
     let pool = controllers - scenario.plugins.len() as u32;
@@ -91,6 +93,8 @@ pub fn run_controller(
     let identity = identity(&attachment.reply, Role::Controller);
     let mut driver = ControllerDriver::new(role, ports, identity, first_step);
     attachment.ready(stop)?;
+    // Declared last, so let go first.
+    let _held = held;
     let patience = Patience::of(wait, Role::Controller, 1 + controllers as usize, peer_timeout);
     Waiter::new(patience, bell, stop.clone(), attachment.world()).drive(|| driver.advance())
 }

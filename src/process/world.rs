@@ -2,7 +2,7 @@
 
 use super::attach::Reception;
 use super::placement::number_of_cores;
-use super::{Patience, ProcessError, Settled, StopFlag, WaitMode, Waiter};
+use super::{Patience, ProcessError, Settled, Settling, StopFlag, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Progress, WorldDriver, WorldPorts};
 use crate::scenario::Scenario;
@@ -185,6 +185,7 @@ pub fn check_cores(processes: usize) -> Result<(), ProcessError> {
 pub fn run_world(
     scenario: &Arc<Scenario>,
     options: &WorldOptions,
+    settling: &Settling<'_>,
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
@@ -192,6 +193,7 @@ pub fn run_world(
     if wait == WaitMode::Spin {
         check_cores(1 + (coordinators + controllers) as usize)?;
     }
+    let held = settling.settle(Role::World, 0, wait, wait.hot_processes(coordinators, controllers));
     let space = RunSpace::enter(&options.run)?;
     let mut run_id = [0u8; 8];
     if rustix::rand::getrandom(&mut run_id, rustix::rand::GetRandomFlags::NONBLOCK).is_err() {
@@ -218,6 +220,8 @@ pub fn run_world(
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
     let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
+    // Declared last, so let go first.
+    let _held = held;
     let mut meter = StepMeter::start();
     let mut step = 0;
     loop {
