@@ -49,12 +49,11 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         observed: args.observed || observation.is_some(),
         run_id: Some(run_id),
     };
-    let hot_processes = args.wait_mode.hot_processes(options.coordinators, options.controllers);
     let report = report_to(args.supervised, &args.wait);
-    settling(&args.wait, &*report).settle(Role::World, 0, args.wait_mode, hot_processes);
+    let settling = settling(&args.wait, &*report);
     if args.supervised.is_some() {
         let mut last = Instant::now();
-        let outcome = run_world(&scenario, &options, resume.as_ref(), &stop, |world| {
+        let outcome = run_world(&scenario, &options, resume.as_ref(), &settling, &stop, |world| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
                 say(&WorldLine::progress(world));
@@ -63,7 +62,7 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         say(&WorldLine::Outcome(Box::new(outcome)));
         return Ok(());
     }
-    let outcome = run_world(&scenario, &options, resume.as_ref(), &stop, |_: &World| {});
+    let outcome = run_world(&scenario, &options, resume.as_ref(), &settling, &stop, |_: &World| {});
     let outcome = outcome.map_err(AppError::from);
     let recorded = match observation {
         Some(observation) => observation.stop()?.finish(&outcome),

@@ -36,7 +36,7 @@ pub fn run_coordinator(
     let own = |prefix: &str| format!("{prefix}{index}");
     let wait = WaitMode::from_code(attachment.reply.waiting);
     let bell = wait.has_bell(Role::Coordinator).then(|| space.bell(&own(frames::BELL_COORDINATOR_PREFIX)));
-    settling.settle(Role::Coordinator, index, wait, wait.hot_processes(coordinators, controllers));
+    let held = settling.settle(Role::Coordinator, index, wait, wait.hot_processes(coordinators, controllers));
     let neighbours = (0..coordinators)
         .filter(|n| mask >> n & 1 == 1)
         .map(|n| {
@@ -63,6 +63,8 @@ pub fn run_coordinator(
         driver.take_over(handover);
     }
     let hot_processes = 1 + controllers as usize;
+    // Declared last, so let go first.
+    let _held = held;
     let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
     Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world())
         .drive(&mut driver, || attachment.catch_up(stop))
@@ -82,7 +84,7 @@ pub fn run_controller(
     let wait = WaitMode::from_code(attachment.reply.waiting);
     let own_bell = || space.bell(&format!("{}{index}", frames::BELL_CONTROLLER_PREFIX));
     let bell = wait.has_bell(Role::Controller).then(own_bell).flatten();
-    settling.settle(Role::Controller, index, wait, wait.hot_processes(coordinators, controllers));
+    let held = settling.settle(Role::Controller, index, wait, wait.hot_processes(coordinators, controllers));
     let scenario = &attachment.scenario;
     // Plug-ins come behind the processes of the pool.
     let pool = controllers - scenario.plugins.len() as u32;
@@ -101,6 +103,8 @@ pub fn run_controller(
     if let Some(handover) = attachment.ready(stop)? {
         driver.take_over(handover);
     }
+    // Declared last, so let go first.
+    let _held = held;
     let patience = Patience::of(wait, Role::Controller, 1 + controllers as usize, peer_timeout);
     Waiter::new(patience, bell, stop.clone(), attachment.world())
         .drive(&mut driver, || attachment.catch_up(stop))

@@ -13,8 +13,8 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 use thread_priority::{
-    RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy, set_thread_priority_and_policy,
-    thread_native_id, thread_schedule_policy,
+    NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id, thread_schedule_policy,
 };
 
 /// Priority of world and controllers: above whatever is not real-time, below interrupt threads (50).
@@ -64,7 +64,7 @@ impl std::fmt::Display for Settled {
 impl Settling<'_> {
     /// Settles the calling process, in a run of that many processes that wait busily (world and
     /// controllers; all of them when everybody spins). Never fails: what is refused is reported.
-    pub fn settle(&self, role: Role, index: u32, wait: WaitMode, hot_processes: usize) {
+    pub fn settle(&self, role: Role, index: u32, wait: WaitMode, hot_processes: usize) -> Held {
         place(self.pin, role, index);
         let process = if role == Role::World { role.to_string() } else { format!("{role} {index}") };
         let (mut memory_locked, mut memory_note) = (false, None);
@@ -78,6 +78,27 @@ impl Settling<'_> {
         };
         let cores = cores();
         (self.report)(&Settled { process, cores, scheduling, memory_locked, memory_note });
+        Held(())
+    }
+}
+
+/// Real-time scheduling, for as long as it is held, where it was granted.
+///
+/// It must be let go before the run's space is: clean-up is the file system's work, where processes wait for
+/// each other inside the kernel, and one that gives way to nobody there can wait for ever for another on its
+/// core (seen: two processes of equal priority removing one directory).
+#[derive(Debug)]
+#[must_use]
+pub struct Held(());
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        if is_fifo() {
+            let other = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
+            // Giving up is always allowed. 49 of 99 is what the library makes niceness 0 of.
+            let ordinary = ThreadPriority::Crossplatform(49.try_into().expect("priorities are below 100"));
+            let _ = set_thread_priority_and_policy(thread_native_id(), ordinary, other);
+        }
     }
 }
 

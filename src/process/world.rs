@@ -5,8 +5,8 @@ use super::observe::{self, ObservedSteps};
 use super::pace::Pacer;
 use super::placement::number_of_cores;
 use super::{
-    OnMiss, Pace, Patience, Peer, Peers, ProcessError, Punctuality, Settled, StopFlag, Timing, WaitMode,
-    Waiter,
+    OnMiss, Pace, Patience, Peer, Peers, ProcessError, Punctuality, Settled, Settling, StopFlag, Timing,
+    WaitMode, Waiter,
 };
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Awaited, Handover, Ledger, Progress, RefusedFrames, Seat, WorldDriver, WorldPorts};
@@ -268,6 +268,7 @@ pub fn run_world(
     scenario: &Arc<Scenario>,
     options: &WorldOptions,
     resume: Option<&Reader<FileSource>>,
+    settling: &Settling<'_>,
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
@@ -288,6 +289,7 @@ pub fn run_world(
     if wait == WaitMode::Spin {
         check_cores(1 + (coordinators + controllers) as usize)?;
     }
+    let held = settling.settle(Role::World, 0, wait, wait.hot_processes(coordinators, controllers));
     let space = RunSpace::enter(&options.run)?;
     let run_id = options.run_id.unwrap_or_else(new_run_id);
     let active = |error| match error {
@@ -336,6 +338,8 @@ pub fn run_world(
     };
     let mut history = History::default();
     let is_paced = options.timing.pace == Pace::Realtime;
+    // Declared last, so let go first.
+    let _held = held;
     let mut meter = StepMeter::start();
     let mut step = first_step;
     loop {
