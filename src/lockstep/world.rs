@@ -109,11 +109,10 @@ where
                 check_reached("a coordinator's state frame", step, loan.send()?, 1, finished)?;
             }
         }
-        let world = &self.world;
-        let count = world.record_count();
-        let loan =
-            self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
-        self.world.seal(loan.records());
+        let world = &mut self.world;
+        let loan = self.ports.state.loan(header, world.record_count(), |slots| {
+            world.publish(|records| slots.extend_from_slice(records));
+        })?;
         check_reached("the state frame", step, loan.send()?, self.controllers, finished)?;
         self.phase =
             if finished { Phase::Finished } else { Phase::Collect { missing: mask_of(self.controllers) } };
