@@ -34,7 +34,7 @@ impl Lane {
 }
 
 /// How many lanes ahead to fetch: some hundred nanoseconds of work, which is how far memory is away.
-pub(crate) const AHEAD: usize = 3;
+pub(crate) const AHEAD: usize = 6;
 
 /// Has the processor fetch items that will soon be read, without waiting for them.
 #[inline]

@@ -157,7 +157,7 @@ fn parts_started_by_hand_leave_and_rejoin() {
     let summary = world.ended().json();
     assert_eq!(common::hash(&summary), expected);
     assert_eq!(summary["replacements"].as_array().unwrap().len(), 2);
-    successors.map(|part| part.ended().expect(0, &[]));
+    successors.into_iter().for_each(|part| part.ended().expect(0, &[]));
     assert!(coordinator.ended().was_killed_by(Signal::KILL));
     site.assert_clean();
 }

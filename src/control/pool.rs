@@ -48,7 +48,7 @@ struct Member {
 }
 
 /// About as many records as [`AHEAD`] zones have.
-const RECORDS_AHEAD: usize = 16;
+const RECORDS_AHEAD: usize = 24;
 
 /// An assignment, resolved to a place in the zone's slice of the state frame. The slice keeps its
 /// shape until the zone's next event, and with that event come new assignments.

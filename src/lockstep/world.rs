@@ -273,11 +273,11 @@ where
                 loan.send()?;
             }
         }
-        let world = &self.world;
+        let world = &mut self.world;
         let count = world.record_count();
-        let loan =
-            self.ports.state.loan(header, count, |slots| world.records().for_each(|r| slots.push(r)))?;
-        self.world.seal(loan.records());
+        let loan = self.ports.state.loan(header, count, |slots| {
+            world.publish(|records| slots.extend_from_slice(records));
+        })?;
         if self.observer.is_some() {
             self.published.clear();
             self.published.extend_from_slice(loan.records());

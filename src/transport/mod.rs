@@ -101,6 +101,18 @@ impl<'a, R: Record> Slots<'a, R> {
         self.filled += 1;
     }
 
+    /// Writes the next records.
+    ///
+    /// # Panics
+    /// When there are fewer left to write.
+    pub fn extend_from_slice(&mut self, records: &[R]) {
+        let slots = &mut self.slots[self.filled..self.filled + records.len()];
+        for (slot, record) in slots.iter_mut().zip(records) {
+            slot.write(*record);
+        }
+        self.filled += records.len();
+    }
+
     fn assert_full(&self) {
         assert_eq!(self.filled, self.slots.len(), "a frame is filled with as many records as were asked for");
     }

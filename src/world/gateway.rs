@@ -136,6 +136,11 @@ impl Gateway {
         }
     }
 
+    /// Whether commands are applied as they are.
+    pub(super) fn is_off(&self) -> bool {
+        self.mode == ShieldMode::Off
+    }
+
     pub(super) fn summary(&self) -> ShieldSummary {
         ShieldSummary { mode: self.mode, controllers: self.rows.clone() }
     }
@@ -340,7 +345,7 @@ impl World {
     }
 
     /// Index 0 moves with the vehicle it stands for.
-    fn hold_left(&mut self, scenario: &Scenario, zone: usize) {
+    pub(super) fn hold_left(&mut self, scenario: &Scenario, zone: usize) {
         let Car { vehicle, v_mps, .. } = self.cars[zone][0];
         let mut u = self.followed_mps2(zone, vehicle);
         // Out of the network nobody drives it. Whoever left it creeping must not creep for ever: those behind

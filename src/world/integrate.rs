@@ -30,7 +30,12 @@ impl World {
         let scenario = self.scenario.clone();
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
-        self.hold_all(&scenario, dt_s);
+        // Where vehicles in zones depend on nobody's command but their own, each zone settles what they hold
+        // as its turn comes: what is downstream of it has not moved yet.
+        let alone = self.on_links == 0 && self.gateway.is_off();
+        if !alone {
+            self.hold_all(&scenario, dt_s);
+        }
         self.scratch.entries.clear();
         self.scratch.leaders.clear();
         self.events.clear();
@@ -40,6 +45,9 @@ impl World {
         // step's beginning, so it does not matter which zone has moved on already.
         for zone in 0..self.sites.len() {
             self.cars.fetch(zone + AHEAD);
+            if alone && self.sites[zone].has_left {
+                self.hold_left(&scenario, zone);
+            }
             let crosses = self.look(&scenario, zone, dt_s);
             self.sites[zone].left_now = crosses;
             if crosses {

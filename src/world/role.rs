@@ -13,7 +13,7 @@ use crate::vehicle::Held;
 use ipc_schemas::{self as frames, VehicleState};
 use std::ops::Range;
 use std::sync::Arc;
-use xxhash_rust::xxh3::xxh3_64_with_seed;
+use xxhash_rust::xxh3::{Xxh3, xxh3_64_with_seed};
 
 /// The world.
 ///
@@ -75,9 +75,14 @@ impl Site {
     }
 }
 
+/// Records handed out at a time, and what the zone at the end has more: few enough for the innermost cache.
+const BATCH: usize = 128;
+
 /// Lists that live for a part of a step; kept for their allocations.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
+    /// Records about to be handed out.
+    batch: Vec<VehicleState>,
     /// Motion of each car of a zone over the step.
     pub motions: Vec<Held>,
     /// Vehicles about to enter a zone.
@@ -133,7 +138,7 @@ impl World {
             metrics: vec![ZoneMetrics::default(); zones],
             visits: None,
             events: Vec::new(),
-            scratch: Scratch::default(),
+            scratch: Scratch { batch: Vec::with_capacity(2 * BATCH), ..Scratch::default() },
             state_hash: 0,
             coordinators: shares,
             neighbours,
@@ -218,11 +223,13 @@ impl World {
 
     /// The records of the present state frame (see [`VehicleState`] for their order).
     pub fn records(&self) -> impl Iterator<Item = VehicleState> + '_ {
-        let in_zones = (0..self.sites.len() as ZoneId).flat_map(|z| self.zone_records(z));
+        (0..self.sites.len() as ZoneId).flat_map(|z| self.zone_records(z)).chain(self.link_records())
+    }
+
+    fn link_records(&self) -> impl Iterator<Item = VehicleState> + '_ {
         // Most networks have no links: an empty range spares the walk over them.
         let links = if self.on_links == 0 { &[][..] } else { &self.links[..] };
-        let on_links = links.iter().flat_map(|link| &link.cars);
-        in_zones.chain(on_links.map(|c| self.record(&c.car, frames::NO_ZONE, 0)))
+        links.iter().flat_map(|link| &link.cars).map(|c| self.record(&c.car, frames::NO_ZONE, 0))
     }
 
     /// A zone's S(t).
@@ -253,6 +260,35 @@ impl World {
             kind: frames::KIND_CAV,
             flags,
         }
+    }
+
+    /// Hands out the records of the present state frame, some at a time, and chains them into the state hash:
+    /// [`records`](Self::records) and [`seal`](Self::seal) in one, while what is written is near.
+    pub fn publish(&mut self, mut emit: impl FnMut(&[VehicleState])) {
+        let mut batch = std::mem::take(&mut self.scratch.batch);
+        if self.record_count() <= BATCH {
+            batch.extend(self.records());
+            emit(&batch);
+            self.seal(&batch);
+            batch.clear();
+        } else {
+            let mut hash = Xxh3::with_seed(self.state_hash);
+            let mut hand_out = |batch: &mut Vec<VehicleState>| {
+                hash.update(frames::bytes_of(batch));
+                emit(batch);
+                batch.clear();
+            };
+            for zone in 0..self.sites.len() as ZoneId {
+                batch.extend(self.zone_records(zone));
+                if batch.len() >= BATCH {
+                    hand_out(&mut batch);
+                }
+            }
+            batch.extend(self.link_records());
+            hand_out(&mut batch);
+            self.state_hash = hash.digest();
+        }
+        self.scratch.batch = batch;
     }
 
     /// Chains a published state frame into the state hash.
