@@ -3,8 +3,8 @@
 use crate::scenario::{Approach, Demand, Exit, Poisson, RatePeriod, Road, Source, SpeedDistribution, Zone};
 use crate::scenario::{Override, Scenario, ScenarioError, load_embedded};
 
-/// Mean number of vehicles at once in one corridor under the demand below, measured.
-const VEHICLES_PER_CORRIDOR: f64 = 12.4;
+/// Mean number of vehicles at once in one corridor under the demand below, once it has filled up; measured.
+const VEHICLES_PER_CORRIDOR: f64 = 10.4;
 
 /// A network of corridors that holds about `vehicles` at once, with steady demand until `until_s`.
 ///
@@ -59,4 +59,30 @@ pub fn corridors(vehicles: usize, until_s: f64) -> Result<Scenario, ScenarioErro
     scenario.max_vehicles = None;
     scenario.max_time_s = until_s;
     Ok(scenario)
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::lockstep::in_process::InProcess;
+    use std::sync::Arc;
+
+    #[test]
+    fn corridors_hold_what_was_asked_for_from_the_end_of_the_warm_up_on() {
+        let scenario = Arc::new(corridors(2_000, 90.0).unwrap());
+        let mut run = InProcess::new(&scenario, 1, 1);
+        let (mut sum, mut steps) = (0.0, 0.0);
+        while run.step().unwrap() {
+            let world = run.world();
+            // What `cz bench scale` measures begins 500 steps into the run.
+            if world.step() > 500 {
+                let vehicles = f64::from(world.arrived() - world.departed());
+                assert!((vehicles - 2_000.0).abs() < 0.06 * 2_000.0, "{vehicles} in step {}", world.step());
+                (sum, steps) = (sum + vehicles, steps + 1.0);
+            }
+        }
+        let mean: f64 = sum / steps;
+        assert!(steps > 300.0 && (mean - 2_000.0).abs() < 0.03 * 2_000.0, "{mean} over {steps} steps");
+    }
 }

@@ -140,7 +140,9 @@ impl Law {
     }
 
     /// Decides one vehicle's command and updates its memory.
-    #[inline]
+    // In one piece with `program`: handed over in memory, a program is stored field by field and at once
+    // loaded two fields at a time, for which the processor waits.
+    #[inline(always)]
     pub fn decide<P>(&self, s: &Situation, partners: P, memory: &mut Memory) -> Decision
     where
         P: Iterator<Item = Partner> + Clone,
@@ -169,7 +171,7 @@ impl Law {
     }
 
     /// The program of `equ:ocbf_qp` for this step; `None` in FE mode, which does not solve one.
-    #[inline]
+    #[inline(always)]
     pub fn program<P>(&self, s: &Situation, partners: P, memory: &mut Memory) -> Option<Program>
     where
         P: Iterator<Item = Partner> + Clone,

@@ -24,7 +24,7 @@ pub struct Tracking {
 
 impl Tracking {
     /// The minimiser without bounds on u.
-    #[inline]
+    #[inline(always)]
     pub fn free_minimum_mps2(&self) -> f64 {
         let y = self.error_mps;
         let row = 2.0 * y * self.u_ref_mps2 + self.clf_rate_per_s * y * y;
@@ -43,7 +43,7 @@ impl Tracking {
 }
 
 /// Solves the program; `None` when no acceleration satisfies the rows.
-#[inline]
+#[inline(always)]
 pub fn solve(tracking: &Tracking, interval: &Interval) -> Option<f64> {
     if interval.is_empty() {
         return None;

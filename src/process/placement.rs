@@ -10,8 +10,8 @@ pub enum Placement {
     /// Wherever the system puts them.
     #[default]
     None,
-    /// The world on the first core; controllers on the others in turn; coordinators with the controllers,
-    /// where a hand-over costs no wake-up of an idle core.
+    /// The world on the first core; controllers on the others in turn, then on the first too; coordinators
+    /// with the controllers, where a hand-over costs no wake-up of an idle core.
     Auto,
 }
 
@@ -48,6 +48,8 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     let core = match (role, &cores[..]) {
         (_, []) => return None,
         (Role::World, [first, ..]) | (_, [first]) => *first,
+        // Controllers in excess share the world's core too: it has nothing to do while they work.
+        (Role::Controller, all) => all[(index as usize + 1) % all.len()],
         (_, [_, others @ ..]) => others[index as usize % others.len()],
     };
     let mut set = CpuSet::new();
