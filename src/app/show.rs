@@ -479,6 +479,8 @@ fn verdict(command: &VehicleCommand) -> String {
             format!("bound by {}", rows.map(|(_, name)| name).collect::<Vec<_>>().join(", "))
         }
         frames::VERDICT_INFEASIBLE => "infeasible: braking fully".to_owned(),
+        frames::VERDICT_HELD => "held: no answer in time".to_owned(),
+        frames::VERDICT_FALLBACK => "held as far as the shield allows: no answer in time".to_owned(),
         other => format!("verdict {other}"),
     }
 }

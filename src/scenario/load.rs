@@ -116,9 +116,11 @@ pub fn load_recorded(
     overrides: &[Override],
     seed: u64,
 ) -> Result<Scenario, ScenarioError> {
-    let recorded = recorded.iter().map(|set| set.parse()).collect::<Result<Vec<Override>, _>>()?;
+    let seed = format!("seed={seed}");
+    let recorded = recorded.iter().chain([&seed]).map(|set| set.parse());
+    let recorded = recorded.collect::<Result<Vec<Override>, _>>()?;
     let all = [&recorded, overrides].concat();
-    load_text("<recording>", text, TraceBase::Embedded, &all, Some(seed))
+    load_text("<recording>", text, TraceBase::Embedded, &all, None)
 }
 
 fn load_text(
