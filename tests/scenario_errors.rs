@@ -116,7 +116,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "dts = 0.1",
-        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers; did you mean dt_s?",
+        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "dt_s = 0.1",
@@ -487,11 +487,11 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "dt=0.1",
-        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers; did you mean dt_s?",
+        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "network.size=3",
-        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers",
+        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults",
     ),
     (
         "control.replan=from_stat",
@@ -621,8 +621,8 @@ fn missing_scenarios_and_seeds() {
     let error = |r: Result<Scenario, ScenarioError>| r.unwrap_err().to_string();
     assert_eq!(
         error(load(Some("two-merge"), &[], None)),
-        "two-merge: no such scenario; expected one of two-merges, varying-demand, corridor-8, tree, or the path \
-         of a TOML file; did you mean two-merges?"
+        "two-merge: no such scenario; expected one of two-merges, varying-demand, corridor-8, tree, \
+         faulty-sensors, or the path of a TOML file; did you mean two-merges?"
     );
     for path in ["nowhere/two-merges", "nowhere.toml"] {
         let message = error(load(Some(path), &[], None));

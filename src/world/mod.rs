@@ -1,6 +1,7 @@
 //! The world role: arrivals, vehicle states, integration, metrics. Commands in, states out.
 
 mod car;
+mod faults;
 mod gate;
 mod gateway;
 mod integrate;
@@ -9,5 +10,5 @@ mod metrics;
 mod role;
 
 pub use gateway::CommandFault;
-pub use metrics::{CompletedVisit, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
+pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
 pub use role::{CoordinatorMasks, World};
