@@ -241,7 +241,9 @@ fn demand(demand: &Demand, vehicle: &VehicleParams) -> Check {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
-    use crate::scenario::{Override, Scenario, decode, embedded_names, encode, load, load_embedded};
+    use crate::scenario::{
+        Faults, Override, Scenario, SensorKind, decode, embedded_names, encode, load, load_embedded,
+    };
 
     #[test]
     fn what_the_loader_makes_is_sound() {
@@ -257,10 +259,14 @@ mod tests {
         assert_eq!(crate::bench::corridors(500, 60.0).unwrap().check(), Ok(()));
     }
 
+    fn faults(scenario: &mut Scenario) -> &mut Faults {
+        scenario.faults.as_mut().unwrap()
+    }
+
     #[test]
     fn what_it_would_refuse_is_not() {
         let sound = load_embedded("two-merges", &[], None).unwrap();
-        let spoil: [fn(&mut Scenario); 14] = [
+        let spoil: [fn(&mut Scenario); 22] = [
             |s| s.dt_ns = 0,
             |s| s.max_time_s = f64::NAN,
             |s| s.beta = 0.0,
@@ -285,7 +291,17 @@ mod tests {
                 let approaches = vec![(7, 0)];
                 s.plugins = vec![crate::scenario::Plugin { name: "p".into(), approaches, command: None }];
             },
+            |s| s.faults = Some(Faults::default()),
+            |s| faults(s).noise.as_mut().unwrap().position_sd_m = -1.0,
+            |s| faults(s).noise.as_mut().unwrap().span.until_s = 0.0,
+            |s| faults(s).sensors[0].kind = SensorKind::Bias { position_m: f64::NAN, speed_mps: 0.0 },
+            |s| faults(s).sensors[0].scope.fraction = 0.0,
+            |s| faults(s).commands.as_mut().unwrap().loss = 1.1,
+            |s| faults(s).commands.as_mut().unwrap().delay_steps = 0,
+            |s| faults(s).stalls[0].scope.approaches = Some(vec![(1, 0), (0, 7)]),
         ];
+        let sound = Scenario { faults: load_embedded("faulty-sensors", &[], None).unwrap().faults, ..sound };
+        assert_eq!(sound.check(), Ok(()));
         for (i, spoil) in spoil.into_iter().enumerate() {
             let mut scenario = sound.clone();
             spoil(&mut scenario);
