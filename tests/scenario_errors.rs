@@ -108,6 +108,21 @@ fn the_base_is_valid() {
 /// Text of the base, its replacement, and the message.
 const FILE_CASES: &[(&str, &str, &str)] = &[
     (
+        "[control]",
+        "[[faults.sensors]]\nkind = \"frozen\"\nposition_m = 2\n[control]",
+        "s.toml:12: faults.sensors.0.position_m = 2: unknown key; expected one of kind, zones, approaches, fraction, from_s, until_s",
+    ),
+    (
+        "[control]",
+        "[faults]\nnoise = { position_sd_m = 0.5, speed_sd_mps = \"low\" }\n[control]",
+        "s.toml:11: faults.noise.speed_sd_mps = \"low\": expected a standard deviation from 0 to 1e6 m/s",
+    ),
+    (
+        "[control]",
+        "[[faults.stalls]]\napproaches = [\"second.c\"]\n[control]",
+        "s.toml:11: faults.stalls.0.approaches.0 = \"second.c\": expected one of a, b",
+    ),
+    (
         "dt_s = 0.1",
         "dt_s = 0.1 0",
         "s.toml:3: not valid TOML: string values must be quoted, expected literal string",
@@ -116,7 +131,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "dts = 0.1",
-        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers; did you mean dt_s?",
+        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "dt_s = 0.1",
@@ -473,6 +488,83 @@ fn bad_files() {
 
 /// What follows `--set`, and the message.
 const SET_CASES: &[(&str, &str)] = &[
+    (
+        "faults.nose={}",
+        "--set faults.nose={}: faults.nose = {...}: unknown key; expected one of noise, sensors, commands, stalls; did you mean noise?",
+    ),
+    ("faults=all", "--set faults=all: faults = \"all\": expected a table"),
+    (
+        "faults.noise=1",
+        "--set faults.noise=1: faults.noise = 1: expected a table such as {position_sd_m = 0.5}",
+    ),
+    (
+        "faults.noise={}",
+        "--set faults.noise={}: faults.noise.position_sd_m: missing key; expected a standard deviation in m, or speed_sd_mps instead",
+    ),
+    (
+        "faults.noise.speed_sd_mps=-0.1",
+        "--set faults.noise.speed_sd_mps=-0.1: faults.noise.speed_sd_mps = -0.1: expected a standard deviation from 0 to 1e6 m/s",
+    ),
+    (
+        "faults.noise.position_sd_m=nan",
+        "--set faults.noise.position_sd_m=nan: faults.noise.position_sd_m = nan: expected a standard deviation from 0 to 1e6 m",
+    ),
+    (
+        "faults.commands={}",
+        "--set faults.commands={}: faults.commands.loss: missing key; expected a probability from 0 to 1, or delay_steps instead",
+    ),
+    (
+        "faults.commands.loss=1.5",
+        "--set faults.commands.loss=1.5: faults.commands.loss = 1.5: expected a probability from 0 to 1",
+    ),
+    (
+        "faults.commands.delay_probability=0.5",
+        "--set faults.commands.delay_probability=0.5: faults.commands.delay_steps: missing key; expected an integer from 1 to 1000",
+    ),
+    (
+        "faults.commands.delay_steps=0",
+        "--set faults.commands.delay_steps=0: faults.commands.delay_steps = 0: expected an integer from 1 to 1000",
+    ),
+    (
+        "faults.commands.delay_steps=1001",
+        "--set faults.commands.delay_steps=1001: faults.commands.delay_steps = 1001: expected an integer from 1 to 1000",
+    ),
+    (
+        "faults.sensors=[]",
+        "--set faults.sensors=[]: faults.sensors = []: expected a list of tables such as {kind = \"frozen\"}",
+    ),
+    (
+        "faults.sensors=[{}]",
+        "--set faults.sensors=[{}]: faults.sensors.0.kind: missing key; expected \"bias\" or \"frozen\"",
+    ),
+    (
+        "faults.sensors=[{kind=\"stuck\"}]",
+        "--set faults.sensors=[{kind=\"stuck\"}]: faults.sensors.0.kind = \"stuck\": expected \"bias\" or \"frozen\"",
+    ),
+    (
+        "faults.sensors=[{kind=\"bias\"}]",
+        "--set faults.sensors=[{kind=\"bias\"}]: faults.sensors.0.position_m: missing key; expected what is added to the position in m, or speed_mps instead",
+    ),
+    (
+        "faults.stalls=[{fraction=0}]",
+        "--set faults.stalls=[{fraction=0}]: faults.stalls.0.fraction = 0: expected a fraction with 0 < fraction <= 1",
+    ),
+    (
+        "faults.stalls=[{from_s=5,until_s=5}]",
+        "--set faults.stalls=[{from_s=5,until_s=5}]: faults.stalls.0.until_s = 5: expected a time > from_s = 5 and at most 1e9 s",
+    ),
+    (
+        "faults.stalls=[{from_s=-1}]",
+        "--set faults.stalls=[{from_s=-1}]: faults.stalls.0.from_s = -1: expected a time from 0 to below 1e9 s",
+    ),
+    (
+        "faults.stalls=[{zones=[\"frist\"]}]",
+        "--set faults.stalls=[{zones=[\"frist\"]}]: faults.stalls.0.zones.0 = \"frist\": expected one of first, second; did you mean first?",
+    ),
+    (
+        "faults.stalls=[{zones=[\"second\"],approaches=[\"second.b\"]}]",
+        "--set faults.stalls=[{zones=[\"second\"],approaches=[\"second.b\"]}]: faults.stalls.0.approaches = [\"second.b\"]: an approach is named twice; expected each once",
+    ),
     ("dt_s", "--set dt_s: no '='; expected key=value"),
     ("=1", "--set =1: empty key; expected a dotted key such as end.vehicles"),
     ("end..vehicles=1", "--set end..vehicles=1: empty key; expected a dotted key such as end.vehicles"),
@@ -487,11 +579,11 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "dt=0.1",
-        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers; did you mean dt_s?",
+        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "network.size=3",
-        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers",
+        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults",
     ),
     (
         "control.replan=from_stat",
@@ -621,8 +713,8 @@ fn missing_scenarios_and_seeds() {
     let error = |r: Result<Scenario, ScenarioError>| r.unwrap_err().to_string();
     assert_eq!(
         error(load(Some("two-merge"), &[], None)),
-        "two-merge: no such scenario; expected one of two-merges, varying-demand, corridor-8, tree, or the path \
-         of a TOML file; did you mean two-merges?"
+        "two-merge: no such scenario; expected one of two-merges, varying-demand, corridor-8, tree, \
+         faulty-sensors, or the path of a TOML file; did you mean two-merges?"
     );
     for path in ["nowhere/two-merges", "nowhere.toml"] {
         let message = error(load(Some(path), &[], None));
@@ -698,6 +790,41 @@ fn sets_reach_what_they_name() {
     assert_eq!(load_embedded("tree", &sets, Some(9)).unwrap().seed, 9);
     assert_eq!(load_embedded("tree", &sets, None).unwrap().seed, 3);
     assert_eq!(load_embedded("tree", &[], Some(u64::MAX)).unwrap().seed, u64::MAX);
+}
+
+#[test]
+fn faults_are_read_with_their_defaults() {
+    use control_zones::scenario::{
+        CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall,
+    };
+    assert_eq!(with(&[]).faults, None);
+    assert_eq!(with(&["faults={}"]).faults, None);
+    let whole = Span { from_s: 0.0, until_s: 1e9 };
+    let everybody = Scope { approaches: None, fraction: 1.0 };
+    let faults = with(&[
+        "faults.noise.speed_sd_mps=0.2",
+        "faults.commands.delay_steps=2",
+        "faults.sensors=[{kind=\"frozen\"},{kind=\"bias\",speed_mps=-1,fraction=0.5,zones=[\"second\"]}]",
+        "faults.stalls=[{from_s=1,until_s=2.5,approaches=[\"second.b\",\"first.a\"]}]",
+    ]);
+    let expected = Faults {
+        noise: Some(Noise { position_sd_m: 0.0, speed_sd_mps: 0.2, span: whole }),
+        sensors: vec![
+            SensorFault { kind: SensorKind::Frozen, scope: everybody, span: whole },
+            SensorFault {
+                kind: SensorKind::Bias { position_m: 0.0, speed_mps: -1.0 },
+                scope: Scope { approaches: Some(vec![(1, 0), (1, 1)]), fraction: 0.5 },
+                span: whole,
+            },
+        ],
+        commands: Some(CommandFaults { loss: 0.0, delay_steps: 2, delay_probability: 1.0, span: whole }),
+        stalls: vec![Stall {
+            scope: Scope { approaches: Some(vec![(0, 0), (1, 1)]), fraction: 1.0 },
+            span: Span { from_s: 1.0, until_s: 2.5 },
+        }],
+    };
+    assert_eq!(faults.faults, Some(expected));
+    assert_eq!(faults.check(), Ok(()));
 }
 
 #[test]

@@ -4,7 +4,7 @@ use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
 use crate::process::{LatencyUs, Outcome, Punctuality, Replacement, Settled};
 use crate::scenario::{Scenario, ShieldMode};
-use crate::world::{ShieldSummary, ZoneSummaryRow};
+use crate::world::{FaultCounts, ShieldSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
 use serde::Serialize;
 use std::path::Path;
@@ -29,6 +29,8 @@ pub(super) struct Summary {
     held_arrivals: u32,
     waiting: u32,
     shield: ShieldSummary,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    faults: Option<FaultCounts>,
     replacements: Vec<Replacement>,
     refused: Vec<RefusedFrames>,
     late_frames: u64,
@@ -72,6 +74,7 @@ impl Summary {
             held_arrivals: world.held_arrivals,
             waiting: world.waiting,
             shield: world.shield,
+            faults: world.faults,
             replacements: outcome.replacements,
             refused: outcome.refused,
             late_frames: outcome.late_frames,
@@ -167,6 +170,17 @@ impl Summary {
             ));
         }
         shield_lines(&self.shield, &mut text);
+        if let Some(f) = &self.faults {
+            text.push_str(&format!(
+                "faults: commands {} lost, {} delayed, {} stalled; records {} noisy, {} biased, {} frozen\n",
+                f.commands_lost,
+                f.commands_delayed,
+                f.commands_stalled,
+                f.records_noisy,
+                f.records_biased,
+                f.records_frozen
+            ));
+        }
         if let Some(p) = &self.punctuality {
             text.push_str(&punctuality_lines(p));
         }

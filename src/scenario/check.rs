@@ -4,9 +4,10 @@
 //! no version of this program wrote.
 
 use super::{
-    Baseline, Demand, Exit, FlowPolicy, Network, Poisson, Scenario, Segment, Source, VehicleParams, Zone,
+    Baseline, Demand, Exit, Faults, FlowPolicy, Network, Poisson, Scenario, Scope, Segment, SensorKind,
+    Source, Span, VehicleParams, Zone,
 };
-use crate::scenario::load::{MAX_COUNT, MAX_RATE_PER_HOUR, MAX_TIME_S};
+use crate::scenario::load::{MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_RATE_PER_HOUR, MAX_TIME_S};
 
 /// The first thing in a scenario that is not as the loader leaves it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -52,7 +53,52 @@ impl Scenario {
             demand(&road.demand, &self.vehicle)
                 .map_err(|fault| ScenarioFault(format!("road {}: {fault}", road.name)))?;
         }
-        self.check_plugins()
+        self.check_plugins()?;
+        self.faults.as_ref().map_or(Ok(()), |faults| self.check_faults(faults))
+    }
+
+    fn check_faults(&self, faults: &Faults) -> Check {
+        require(*faults != Faults::default(), || "faults without a fault".to_owned())?;
+        let probability = |what, p| number(what, p, |p| (0.0..=1.0).contains(&p));
+        let error = |what, size: f64| number(what, size, |size| size.abs() <= MAX_ERROR);
+        if let Some(noise) = &faults.noise {
+            error("position_sd_m", noise.position_sd_m)?;
+            error("speed_sd_mps", noise.speed_sd_mps)?;
+            require(noise.position_sd_m >= 0.0 && noise.speed_sd_mps >= 0.0, || "noise < 0".to_owned())?;
+            span(&noise.span)?;
+        }
+        for sensor in &faults.sensors {
+            if let SensorKind::Bias { position_m, speed_mps } = sensor.kind {
+                error("position_m", position_m)?;
+                error("speed_mps", speed_mps)?;
+            }
+            self.check_scope(&sensor.scope)?;
+            span(&sensor.span)?;
+        }
+        if let Some(commands) = &faults.commands {
+            probability("loss", commands.loss)?;
+            probability("delay_probability", commands.delay_probability)?;
+            let is_sound = commands.delay_steps <= MAX_DELAY
+                && (commands.delay_steps > 0 || commands.delay_probability == 0.0);
+            require(is_sound, || format!("delay_steps = {}", commands.delay_steps))?;
+            span(&commands.span)?;
+        }
+        for stall in &faults.stalls {
+            self.check_scope(&stall.scope)?;
+            span(&stall.span)?;
+        }
+        Ok(())
+    }
+
+    fn check_scope(&self, scope: &Scope) -> Check {
+        number("fraction", scope.fraction, |f| f > 0.0 && f <= 1.0)?;
+        let Some(approaches) = &scope.approaches else { return Ok(()) };
+        let there = |&(zone, path): &(u32, u32)| {
+            self.network.zones.get(zone as usize).is_some_and(|z| (path as usize) < z.approaches.len())
+        };
+        let ascend = approaches.windows(2).all(|w| w[0] < w[1]);
+        let is_sound = !approaches.is_empty() && ascend && approaches.iter().all(there);
+        require(is_sound, || "a fault's approaches".to_owned())
     }
 
     fn check_plugins(&self) -> Check {
@@ -70,6 +116,11 @@ impl Scenario {
         }
         Ok(())
     }
+}
+
+fn span(span: &Span) -> Check {
+    number("from_s", span.from_s, |f| (0.0..MAX_TIME_S).contains(&f))?;
+    number("until_s", span.until_s, |u| u > span.from_s && u <= MAX_TIME_S)
 }
 
 fn vehicle(v: &VehicleParams) -> Check {
@@ -190,7 +241,9 @@ fn demand(demand: &Demand, vehicle: &VehicleParams) -> Check {
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
-    use crate::scenario::{Override, Scenario, decode, embedded_names, encode, load, load_embedded};
+    use crate::scenario::{
+        Faults, Override, Scenario, SensorKind, decode, embedded_names, encode, load, load_embedded,
+    };
 
     #[test]
     fn what_the_loader_makes_is_sound() {
@@ -206,10 +259,14 @@ mod tests {
         assert_eq!(crate::bench::corridors(500, 60.0).unwrap().check(), Ok(()));
     }
 
+    fn faults(scenario: &mut Scenario) -> &mut Faults {
+        scenario.faults.as_mut().unwrap()
+    }
+
     #[test]
     fn what_it_would_refuse_is_not() {
         let sound = load_embedded("two-merges", &[], None).unwrap();
-        let spoil: [fn(&mut Scenario); 14] = [
+        let spoil: [fn(&mut Scenario); 22] = [
             |s| s.dt_ns = 0,
             |s| s.max_time_s = f64::NAN,
             |s| s.beta = 0.0,
@@ -234,7 +291,17 @@ mod tests {
                 let approaches = vec![(7, 0)];
                 s.plugins = vec![crate::scenario::Plugin { name: "p".into(), approaches, command: None }];
             },
+            |s| s.faults = Some(Faults::default()),
+            |s| faults(s).noise.as_mut().unwrap().position_sd_m = -1.0,
+            |s| faults(s).noise.as_mut().unwrap().span.until_s = 0.0,
+            |s| faults(s).sensors[0].kind = SensorKind::Bias { position_m: f64::NAN, speed_mps: 0.0 },
+            |s| faults(s).sensors[0].scope.fraction = 0.0,
+            |s| faults(s).commands.as_mut().unwrap().loss = 1.1,
+            |s| faults(s).commands.as_mut().unwrap().delay_steps = 0,
+            |s| faults(s).stalls[0].scope.approaches = Some(vec![(1, 0), (0, 7)]),
         ];
+        let sound = Scenario { faults: load_embedded("faulty-sensors", &[], None).unwrap().faults, ..sound };
+        assert_eq!(sound.check(), Ok(()));
         for (i, spoil) in spoil.into_iter().enumerate() {
             let mut scenario = sound.clone();
             spoil(&mut scenario);

@@ -1,11 +1,12 @@
 //! Scenarios and arrival traces that are part of the program, so that it runs from any directory.
 
 /// Name and text, the default first.
-pub(super) const SCENARIOS: [(&str, &str); 4] = [
+pub(super) const SCENARIOS: [(&str, &str); 5] = [
     ("two-merges", include_str!("../../scenarios/two-merges.toml")),
     ("varying-demand", include_str!("../../scenarios/varying-demand.toml")),
     ("corridor-8", include_str!("../../scenarios/corridor-8.toml")),
     ("tree", include_str!("../../scenarios/tree.toml")),
+    ("faulty-sensors", include_str!("../../scenarios/faulty-sensors.toml")),
 ];
 
 macro_rules! traces {

@@ -7,8 +7,10 @@
 mod demand;
 mod document;
 mod error;
+mod faults;
 mod overrides;
 mod plugins;
+mod scope;
 mod sections;
 mod table;
 mod topology;
@@ -20,6 +22,7 @@ use super::{Network, Road, Scenario, ShieldMode, embedded};
 use demand::{DemandReader, TraceBase};
 pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
+pub(super) use faults::{MAX_DELAY, MAX_ERROR};
 use std::collections::BTreeMap;
 use std::path::Path;
 use table::Table;
@@ -155,6 +158,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         "roads",
         "zones",
         "controllers",
+        "faults",
     ])?;
     let name = root.name()?.to_owned();
     let seed = match root.get("seed") {
@@ -210,6 +214,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         "shield",
         &[("off", ShieldMode::Off), ("observe", ShieldMode::Observe), ("on", ShieldMode::On)],
     )?;
+    let faults = faults::read(section("faults")?.as_ref(), &topology.zones)?;
     let network = Network { zones: topology.zones, roads };
     Ok(Scenario {
         name,
@@ -223,6 +228,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         beta,
         plugins,
         shield,
+        faults,
     })
 }
 

@@ -8,6 +8,7 @@ mod check;
 pub mod demand;
 mod embedded;
 pub mod encode;
+pub mod faults;
 pub mod load;
 pub mod network;
 pub mod params;
@@ -18,6 +19,7 @@ pub use arrivals::ArrivalStream;
 pub use check::ScenarioFault;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use encode::{DecodeError, decode, encode, scenario_hash};
+pub use faults::{CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall};
 pub use load::{
     DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
     load_recorded, text_of,
@@ -57,6 +59,8 @@ pub struct Scenario {
     pub plugins: Vec<Plugin>,
     /// What the gateway does with unsafe commands.
     pub shield: ShieldMode,
+    /// What goes wrong on purpose.
+    pub faults: Option<Faults>,
 }
 
 impl Scenario {

@@ -28,6 +28,7 @@ impl World {
         fixed(old.dt_ns == new.dt_ns, "dt_s")?;
         fixed(old.seed == new.seed, "seed")?;
         fixed(old.plugins == new.plugins, "controllers")?;
+        fixed(old.faults == new.faults, "faults")?;
         fixed(old.network.zones.len() == new.network.zones.len(), "zones")?;
         for (a, b) in old.network.zones.iter().zip(&new.network.zones) {
             let same = a.name == b.name && a.approaches == b.approaches && a.exit == b.exit;

@@ -6,6 +6,7 @@
 //! that depend on it, and the result does not depend on the order in which frames came.
 
 use super::car::{Car, Guard};
+use super::faults::Limits;
 use super::link::LinkCar;
 use super::metrics::{ShieldRow, ShieldSummary};
 use super::role::World;
@@ -327,9 +328,14 @@ impl World {
         }
     }
 
-    /// Settles what every vehicle holds over the step: zones downstream first, and within a zone in passing
+    /// Settles what every vehicle holds over the step: what has reached it, shielded. Zones downstream first, and within a zone in passing
     /// order, so that whoever a vehicle depends on has been settled before.
     pub(super) fn hold_all(&mut self, scenario: &Scenario, dt_s: f64) {
+        if let Some(faults) = self.faults.as_mut().filter(|faults| faults.has_channels()) {
+            let time_s = scenario.time_s(self.step);
+            let sites = &self.sites;
+            faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, |z| sites[z].first());
+        }
         for zone in (0..self.sites.len()).rev() {
             if self.on_links > 0 {
                 self.drive_link(scenario, zone, dt_s);

@@ -170,6 +170,25 @@ pub struct WorldSummary {
     pub zones: Vec<ZoneSummaryRow>,
     /// What the gateway did.
     pub shield: ShieldSummary,
+    /// What went wrong on purpose, if anything was to.
+    pub faults: Option<FaultCounts>,
+}
+
+/// How often each fault of the scenario struck. Records are those of the state frames to controllers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FaultCounts {
+    /// Commands that never reached their vehicles.
+    pub commands_lost: u64,
+    /// Commands that were late, whether or not a newer one overtook them.
+    pub commands_delayed: u64,
+    /// Commands that a silent controller did not give.
+    pub commands_stalled: u64,
+    /// Records with noise.
+    pub records_noisy: u64,
+    /// Records with a bias.
+    pub records_biased: u64,
+    /// Records that repeated older ones.
+    pub records_frozen: u64,
 }
 
 /// What the actuation gateway did with the commands of each controller.

@@ -2,6 +2,7 @@
 
 mod car;
 mod change;
+mod faults;
 mod gate;
 mod gateway;
 mod integrate;
@@ -11,5 +12,5 @@ mod role;
 
 pub use change::ChangeError;
 pub use gateway::CommandFault;
-pub use metrics::{CompletedVisit, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
+pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
 pub use role::{CoordinatorMasks, World};

@@ -1,6 +1,7 @@
 //! The world as a state machine: state frame out, command frames in, one step on.
 
 use super::car::Car;
+use super::faults::Faults;
 use super::gate::Gates;
 use super::gateway::Gateway;
 use super::integrate::{Entry, Leader};
@@ -10,6 +11,7 @@ use crate::lanes::{AHEAD, Lanes};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Exit, Scenario, ZoneId};
 use crate::vehicle::Held;
+use either::Either;
 use ipc_schemas::{self as frames, VehicleState};
 use std::ops::Range;
 use std::sync::Arc;
@@ -54,6 +56,7 @@ pub struct World {
     summarised: u64,
     pub(super) commanded: u32,
     pub(super) gateway: Gateway,
+    pub(super) faults: Option<Box<Faults>>,
 }
 
 /// What there is to know of a zone beside its vehicles.
@@ -147,6 +150,7 @@ impl World {
             summarised: 0,
             commanded: 0,
             gateway: Gateway::new(&scenario, scenario.controllers(1)),
+            faults: Faults::of(&scenario),
             scenario,
         }
     }
@@ -214,7 +218,13 @@ impl World {
 
     /// The records of the frame for a coordinator process: those of its zones that act in this step.
     pub fn coordinator_records(&self, coordinator: u32) -> impl Iterator<Item = VehicleState> + '_ {
-        self.acting_zones(coordinator).iter().flat_map(|&z| self.zone_records(z))
+        let zones = self.acting_zones(coordinator).iter();
+        match self.sensor_faults() {
+            None => Either::Left(zones.flat_map(|&z| self.zone_records(z))),
+            Some(faults) => {
+                Either::Right(zones.flat_map(move |&z| faults.measured_in(z, self.zone_records(z))))
+            }
+        }
     }
 
     fn acting_zones(&self, coordinator: u32) -> &[ZoneId] {
@@ -223,6 +233,18 @@ impl World {
 
     /// The records of the present state frame (see [`VehicleState`] for their order).
     pub fn records(&self) -> impl Iterator<Item = VehicleState> + '_ {
+        match self.sensor_faults() {
+            None => Either::Left(self.true_records()),
+            Some(faults) => Either::Right(faults.measured(self.true_records())),
+        }
+    }
+
+    /// The faults, if they concern what is published.
+    fn sensor_faults(&self) -> Option<&Faults> {
+        self.faults.as_deref().filter(|faults| faults.has_sensors())
+    }
+
+    fn true_records(&self) -> impl Iterator<Item = VehicleState> + '_ {
         (0..self.sites.len() as ZoneId).flat_map(|z| self.zone_records(z)).chain(self.link_records())
     }
 
@@ -266,7 +288,7 @@ impl World {
     /// [`records`](Self::records) and [`seal`](Self::seal) in one, while what is written is near.
     pub fn publish(&mut self, mut emit: impl FnMut(&[VehicleState])) {
         let mut batch = std::mem::take(&mut self.scratch.batch);
-        if self.record_count() <= BATCH {
+        if self.record_count() <= BATCH || self.sensor_faults().is_some() {
             batch.extend(self.records());
             emit(&batch);
             self.seal(&batch);
@@ -346,6 +368,10 @@ impl World {
         }
         self.integrate();
         self.step += 1;
+        if let Some(mut faults) = self.faults.take_if(|faults| faults.has_sensors()) {
+            faults.sense(self.step, self.scenario.time_s(self.step), self.true_records());
+            self.faults = Some(faults);
+        }
         Ok(())
     }
 
@@ -360,6 +386,7 @@ impl World {
             held_arrivals: self.gates.held,
             waiting: self.gates.waiting.iter().map(|w| w.len() as u32).sum(),
             shield: self.gateway.summary(),
+            faults: self.faults.as_ref().map(|faults| faults.counts()),
             zones: zones
                 .map(|(i, (zone, metrics))| {
                     let mut metrics = metrics.clone();
