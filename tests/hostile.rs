@@ -1,0 +1,118 @@
+//! A process that means harm sends what it should not, and the run goes on to the same result.
+
+#![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
+
+mod common;
+
+use common::{Site, files, unique_name, wait_until};
+use control_zones::transport::iox::{RunName, RunSpace};
+use control_zones::transport::{Loan, Outbox};
+use ipc_schemas::{FrameHeader, Role, SERVICE_COMMAND, VehicleCommand, schema_hash};
+use std::process::{Command, Stdio};
+
+/// Frames the hostile process sends; the run lasts until all are.
+const FRAMES: u64 = 1_000_000;
+/// It knows the run's id, as every participant does.
+const RUN_ID: u64 = 77;
+
+/// Deceives in a different way each time: what the header says, or what the commands do.
+fn forged(i: u64, run_id: u64, step: u64) -> (FrameHeader, Vec<VehicleCommand>) {
+    let good = FrameHeader {
+        run_id,
+        schema_hash: schema_hash(),
+        step,
+        sender_role: Role::Controller as u16,
+        ..FrameHeader::default()
+    };
+    let command = VehicleCommand { u_mps2: -4.0, vehicle: i as u32 % 7, ..VehicleCommand::default() };
+    let header = match i % 8 {
+        0 => FrameHeader { run_id: run_id ^ 1, ..good },
+        1 => FrameHeader { schema_hash: i, ..good },
+        2 => FrameHeader { sender_role: i as u16, ..good },
+        3 => FrameHeader { sender_index: 63, ..good },
+        4 => FrameHeader { generation: 9, ..good },
+        5 => FrameHeader { step: step + 1 + i, ..good },
+        // These two would be taken if it did not matter who sends them.
+        6 => FrameHeader { step: step + 1, ..good },
+        _ => good,
+    };
+    let commands = match i % 3 {
+        0 => vec![],
+        1 => vec![command],
+        _ => vec![VehicleCommand { u_mps2: f64::NAN, zone: u32::MAX, ..command }; 3],
+    };
+    (header, commands)
+}
+
+#[test]
+fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
+    let long = [
+        "varying-demand",
+        "--set",
+        "end.time_s=30000",
+        "--set",
+        "roads.main1.demand.rates=[{until_s=30000.0,vehicles_per_hour=300.0}]",
+    ];
+    let expected = common::hash(&Site::new("u").summary(&[&long[..], &["--in-process"]].concat()));
+    // In the runtime directory of this process, which enters the run's space itself.
+    let name = unique_name("hostile");
+    // So that it ends only when all has been sent: its controller comes late, and leaves the world waiting.
+    let start = |program: &str, arguments: &[&str]| {
+        let mut command = Command::new(program);
+        command.args(arguments).args(["--run", &name]).stdin(Stdio::null()).stdout(Stdio::piped());
+        command.spawn().unwrap()
+    };
+    let world = start(
+        env!("CARGO_BIN_EXE_cz-world"),
+        &[&long[..], &["--json", "-", "--run-id", "77", "--attach-timeout", "600", "--peer-timeout", "600"]].concat(),
+    );
+    let mut coordinator = start(env!("CARGO_BIN_EXE_cz-coord"), &[]);
+    let mut controller = start(env!("CARGO_BIN_EXE_cz-ctrl"), &[]);
+    let run: RunName = name.parse().unwrap();
+    let (mut sent, mut reached_step) = (0, 0);
+    {
+        let space = RunSpace::enter(&run).unwrap();
+        let mut service = None;
+        wait_until("the command service", || {
+            service = space.open::<VehicleCommand>(SERVICE_COMMAND).ok();
+            service.is_some()
+        });
+        let mut outbox = service.unwrap().outbox(8).unwrap();
+        wait_until("the run to be under way", || common::ticks(world.id()) >= 5);
+        let mut stopped = false;
+        while sent < FRAMES {
+            let (header, commands) = forged(sent, RUN_ID, reached_step);
+            let count = commands.len();
+            let loan = outbox.loan(header, count, |slots| commands.iter().for_each(|c| slots.push(*c))).unwrap();
+            // What finds no room has not been sent.
+            if loan.send().unwrap() == 1 {
+                sent += 1;
+                reached_step += sent % 2;
+            } else {
+                assert!(common::is_alive(world.id()), "the run was over after {sent} frames");
+                std::thread::yield_now();
+            }
+            if !stopped && sent > 1000 {
+                // Stepping in spite of the flood so far; from now on the world waits for its controller.
+                common::send(controller.id(), rustix::process::Signal::STOP);
+                stopped = true;
+            }
+        }
+        common::send(controller.id(), rustix::process::Signal::CONT);
+    }
+    let output = world.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(common::hash(&summary), expected, "{summary}");
+    let refused = summary["refused"].as_array().unwrap();
+    let counted: u64 = refused.iter().map(|r| r["frames"].as_u64().unwrap()).sum();
+    assert_eq!(counted, FRAMES, "{refused:?}");
+    let own = format!("process {}", std::process::id());
+    assert!(refused.iter().all(|r| r["sender"].as_str().unwrap().contains(&own)), "{refused:?}");
+    assert!(coordinator.wait().unwrap().success() && controller.wait().unwrap().success());
+    assert!(RunSpace::sweep(&run).unwrap(), "somebody is still in the run");
+    assert_eq!(files(None, &name), Vec::<std::path::PathBuf>::new());
+    let mut kinds: Vec<_> = refused.iter().map(|r| r["last"].to_string()).collect();
+    kinds.sort();
+    println!("{counted} frames refused, of {} kinds of sender, e.g. {:?}", refused.len(), kinds.first());
+}
