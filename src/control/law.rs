@@ -164,8 +164,7 @@ impl Law {
                 let wish = tracking.free_minimum_mps2();
                 let (above, below) = (wish > interval.high, wish < interval.low);
                 let row = select_unpredictable(above, interval.high_row, interval.low_row);
-                let verdict =
-                    select_unpredictable(above || below, Verdict::Bound(row), Verdict::Nominal);
+                let verdict = select_unpredictable(above || below, Verdict::Bound(row), Verdict::Nominal);
                 Decision { u_mps2: u, verdict }
             }
         }

@@ -266,9 +266,8 @@ impl ControllerPool {
 /// The place of a zone's first record, or where it would be. Zones move little from frame to frame, so the
 /// place expected is tried before all are searched.
 fn first_of(states: &[VehicleState], zone: ZoneId, expected: usize) -> usize {
-    let begins_at = |i: usize| {
-        states.get(i).is_some_and(|s| s.zone == zone) && (i == 0 || states[i - 1].zone < zone)
-    };
+    let begins_at =
+        |i: usize| states.get(i).is_some_and(|s| s.zone == zone) && (i == 0 || states[i - 1].zone < zone);
     if begins_at(expected) { expected } else { states.partition_point(|s| s.zone < zone) }
 }
 

@@ -85,8 +85,7 @@ impl Drivers {
             let last = plugin.approaches.iter().map(|&(zone, _)| zone).max();
             zones.push(first.zip(last).map_or(0..0, |(first, last)| first..last + 1));
         }
-        let of_zone =
-            of.iter().map(|of| of.iter().all(|&o| o == of[0]).then(|| of[0])).collect();
+        let of_zone = of.iter().map(|of| of.iter().all(|&o| o == of[0]).then(|| of[0])).collect();
         Drivers { pool, plugins, of, of_zone, zones }
     }
 
