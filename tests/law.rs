@@ -54,6 +54,7 @@ fn scenario() -> Scenario {
             fe_fraction: 0.25,
         },
         beta: 2.0 / 3.0,
+        faults: None,
         plugins: Vec::new(),
         shield: control_zones::scenario::ShieldMode::Off,
     }

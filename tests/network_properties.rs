@@ -184,6 +184,7 @@ fn scenario() -> impl Strategy<Value = Scenario> {
         |(raw, control, seed, dt_ns)| Scenario {
             plugins: Vec::new(),
             shield: control_zones::scenario::ShieldMode::Off,
+            faults: None,
             name: "random".to_owned(),
             seed,
             dt_ns,

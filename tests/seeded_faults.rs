@@ -4,11 +4,12 @@
 
 mod common;
 
-use common::{Site, hash};
+use common::{Site, children, hash, send, ticks, wait_until};
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{Override, Scenario, load};
 use control_zones::world::{FaultCounts, World, WorldSummary};
 use ipc_schemas::{NO_ZONE, STATE_LEFT, VehicleCommand, VehicleState};
+use rustix::process::Signal;
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -111,6 +112,35 @@ fn the_number_of_processes_changes_nothing() {
         for key in ["steps", "zones", "faults"] {
             assert_eq!(summary[key], expected[key], "{way:?}");
         }
+    }
+}
+
+#[test]
+fn a_killed_participant_is_replaced_without_a_trace() {
+    // Long enough to be disturbed in the middle of.
+    let mut sets = ["main1", "merge1", "merge2"]
+        .map(|r| format!("roads.{r}.demand.rates=[{{until_s=10000.0,vehicles_per_hour=300.0}}]"))
+        .to_vec();
+    sets.extend(EVERYTHING.map(str::to_owned));
+    let mut arguments = vec!["varying-demand", "--set", "end.time_s=10000", "--json", "-"];
+    arguments.extend(sets.iter().flat_map(|set| ["--set", set.as_str()]));
+    let expected = Site::new("sf").start("cz", &[&arguments[..], &["--in-process"]].concat()).ended().json();
+    for victim in ["ctrl", "coord"] {
+        let site = Site::new("sf");
+        let supervisor = site.start("cz", &arguments);
+        let mut target = None;
+        wait_until("the run to be in the middle of things", || {
+            let parts = children(supervisor.id());
+            let part = |name| parts.iter().find(|(_, line)| line.get(1).is_some_and(|part| part == name));
+            target = part(victim).map(|(id, _)| *id);
+            target.is_some() && part("world").is_some_and(|(id, _)| ticks(*id) >= 5)
+        });
+        send(target.expect("the wait ended with one"), Signal::KILL);
+        let summary = supervisor.ended().json();
+        assert_eq!(summary["replacements"].as_array().unwrap().len(), 1, "{summary}");
+        assert_eq!(hash(&summary), hash(&expected), "{victim}");
+        assert_eq!(summary["faults"], expected["faults"], "{victim}");
+        site.assert_clean();
     }
 }
 
