@@ -64,7 +64,8 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
     };
     let world = start(
         env!("CARGO_BIN_EXE_cz-world"),
-        &[&long[..], &["--json", "-", "--run-id", "77", "--attach-timeout", "600", "--peer-timeout", "600"]].concat(),
+        &[&long[..], &["--json", "-", "--run-id", "77", "--attach-timeout", "600", "--peer-timeout", "600"]]
+            .concat(),
     );
     let mut coordinator = start(env!("CARGO_BIN_EXE_cz-coord"), &[]);
     let mut controller = start(env!("CARGO_BIN_EXE_cz-ctrl"), &[]);
@@ -83,7 +84,8 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
         while sent < FRAMES {
             let (header, commands) = forged(sent, RUN_ID, reached_step);
             let count = commands.len();
-            let loan = outbox.loan(header, count, |slots| commands.iter().for_each(|c| slots.push(*c))).unwrap();
+            let loan =
+                outbox.loan(header, count, |slots| commands.iter().for_each(|c| slots.push(*c))).unwrap();
             // What finds no room has not been sent.
             if loan.send().unwrap() == 1 {
                 sent += 1;

@@ -236,7 +236,8 @@ fn replay_names_the_role_that_did_otherwise() {
     // A controller that did not answer in time is not held to what the world put in its place.
     let late = run.with(|steps| {
         steps[at].misses = 1 << 1;
-        steps[at].commands[1].records[0].plan_a += 1.0;
+        steps[at].commands[1].records[0].binding_rows ^= 1;
+        steps[at + 1].header.flags |= ipc_schemas::FLAG_MISSED;
     });
     let (names, result) = differing(&late);
     assert_eq!(names, Vec::<String>::new());

@@ -1,6 +1,7 @@
 //! `cz bench`: measurements.
 
 use super::args::{BenchArgs, BenchKind, PeerArgs, Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs};
+use super::record::Recording;
 use super::supervise::{Plan, supervise};
 use super::{AppError, print};
 use crate::bench::{
@@ -66,7 +67,11 @@ const WAIT: WaitArgs = WaitArgs {
     rt: false,
 };
 
-fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, String> {
+fn run_processes(
+    scenario: &ScenarioArgs,
+    controllers: u32,
+    record: Option<&Path>,
+) -> Result<Outcome, String> {
     let plan = Plan {
         run: own_name(),
         scenario,
@@ -75,12 +80,24 @@ fn run_processes(scenario: &ScenarioArgs, controllers: u32) -> Result<Outcome, S
         pool: controllers,
         wait: WAIT,
         wait_mode: WaitMode::Hybrid,
-        restart: Restart::Never,
+        restart: if record.is_some() { Restart::OnFailure } else { Restart::Never },
         timing: TimingArgs::default(),
         run_id: new_run_id(),
         resume: None,
     };
-    supervise(&plan, None, |_| {}).0.map_err(|e| e.to_string())
+    let words = |e: AppError| e.to_string();
+    let recording = match record {
+        Some(path) => {
+            let loaded = scenario.load().map_err(|e| e.to_string())?;
+            Some(Recording::start(path, scenario, &loaded, plan.share, plan.run_id).map_err(words)?)
+        }
+        None => None,
+    };
+    let (outcome, recording) = supervise(&plan, recording, |_| {});
+    if let Some(recording) = recording {
+        recording.finish(&outcome).map_err(words)?;
+    }
+    outcome.map_err(words)
 }
 
 fn own_name() -> RunName {
@@ -99,7 +116,13 @@ fn latency(quick: bool) -> Result<LatencyReport, AppError> {
         scenario,
         round_trips: if quick { 20_000 } else { 200_000 },
         start_peer: &start_peer,
-        run_processes: &|| run_processes(&arguments, 1),
+        run_processes: &|| run_processes(&arguments, 1, None),
+        run_recorded: &|| {
+            let path = std::env::temp_dir().join(format!("cz-bench-{}.czlog", std::process::id()));
+            let outcome = run_processes(&arguments, 1, Some(&path));
+            let _ = std::fs::remove_file(path);
+            outcome
+        },
     };
     Ok(bench::latency(&options)?)
 }
@@ -133,7 +156,7 @@ fn scale(quick: bool, with_sumo: bool) -> Result<ScaleReport, AppError> {
             let scenario = Arc::new(arguments.load().map_err(|e| e.to_string())?);
             return run_in_process(&scenario, 1, 1, &StopFlag::none(), |_| {}).map_err(|e| e.to_string());
         }
-        run_processes(&arguments, controllers)
+        run_processes(&arguments, controllers, None)
     };
     Ok(bench::scale(&ScaleOptions { sizes, run: &run, sumo }, |point| {
         eprintln!("{} vehicles, {} controllers: {} ns", point.vehicles, point.controllers, point.step_ns);
@@ -177,6 +200,7 @@ fn latency_table(r: &LatencyReport) -> String {
     row("event step in one process", &r.in_process_event_step);
     row("step, three processes (ours)", &r.steady_step);
     row("event step, three processes", &r.event_step);
+    row("step, three processes, recorded", &r.recorded_step);
     row("step, two processes", &r.two_process_step);
     row("event step, two processes", &r.two_process_event_step);
     row("step over a unix socket", &r.unix_socket_step);
@@ -185,8 +209,15 @@ fn latency_table(r: &LatencyReport) -> String {
     format!(
         "{}\n{}, {:.1} records per frame\n{table}\n\
          our step / (step in one process + iceoryx2 round trip) = {:.2}; p99 / p50 = {:.1}\n\
-         unix socket / ours = {:.1}; TCP / ours = {:.1}\n",
-        r.machine, r.scenario, r.mean_records, r.ratio_to_parts, r.ratio_tail, r.ratio_unix, r.ratio_tcp
+         unix socket / ours = {:.1}; TCP / ours = {:.1}; recorded / ours = {:.2}\n",
+        r.machine,
+        r.scenario,
+        r.mean_records,
+        r.ratio_to_parts,
+        r.ratio_tail,
+        r.ratio_unix,
+        r.ratio_tcp,
+        r.ratio_recorded
     )
 }
 

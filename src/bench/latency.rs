@@ -32,6 +32,8 @@ pub struct LatencyOptions<'a> {
     pub start_peer: &'a dyn Fn(&[String]) -> std::io::Result<Child>,
     /// Runs the scenario in three processes.
     pub run_processes: &'a dyn Fn() -> Result<Outcome, String>,
+    /// The same, ready to replace processes and recorded.
+    pub run_recorded: &'a dyn Fn() -> Result<Outcome, String>,
 }
 
 /// The results; the JSON keys are a contract. All times in ns.
@@ -61,12 +63,17 @@ pub struct LatencyReport {
     pub two_process_step: Percentiles,
     /// The same for steps in which the coordinator acts.
     pub two_process_event_step: Percentiles,
+    /// A step (without coordination) with three processes in a run that is recorded and in which processes
+    /// may be replaced; a fourth writes the file.
+    pub recorded_step: Percentiles,
     /// A step (without coordination) over a unix socket, two processes.
     pub unix_socket_step: Percentiles,
     /// The same over TCP on the loopback interface.
     pub tcp_step: Percentiles,
     /// `steady_step.p50 / (in_process_step.p50 + iceoryx2_round_trip.p50)`.
     pub ratio_to_parts: f64,
+    /// `recorded_step.p50 / steady_step.p50`.
+    pub ratio_recorded: f64,
     /// `unix_socket_step.p50 / steady_step.p50`.
     pub ratio_unix: f64,
     /// `tcp_step.p50 / steady_step.p50`.
@@ -86,11 +93,13 @@ pub fn latency(options: &LatencyOptions<'_>) -> Result<LatencyReport, BenchError
     let floor = floor(options, affinity.as_ref())?;
     let iceoryx2 = iceoryx2(options, affinity.as_ref(), mean_records.round() as usize)?;
     let processes = unplaced(affinity.as_ref(), options.run_processes).map_err(BenchError::Run)?;
+    let recorded = unplaced(affinity.as_ref(), options.run_recorded).map_err(BenchError::Run)?;
     let two = iceoryx2_step(options, affinity.as_ref())?;
     let unix = socket_step(options, affinity.as_ref(), SocketKind::Unix)?;
     let tcp = socket_step(options, affinity.as_ref(), SocketKind::Tcp)?;
     for (name, hash) in [
         ("three processes", processes.world.state_hash),
+        ("three processes, recorded", recorded.world.state_hash),
         ("two processes", two.state_hash),
         ("unix socket", unix.state_hash),
         ("tcp", tcp.state_hash),
@@ -116,6 +125,8 @@ pub fn latency(options: &LatencyOptions<'_>) -> Result<LatencyReport, BenchError
         event_step: processes.event_ns,
         two_process_step: two.steady,
         two_process_event_step: two.event,
+        recorded_step: recorded.steady_ns,
+        ratio_recorded: ratio(recorded.steady_ns.p50, processes.steady_ns.p50),
         unix_socket_step: unix,
         tcp_step: tcp,
         ratio_to_parts: ratio(processes.steady_ns.p50, in_process.steady_ns.p50 + iceoryx2.p50),

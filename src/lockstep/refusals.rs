@@ -110,14 +110,14 @@ pub(super) struct Refusals {
 }
 
 impl Refusals {
-    /// Enters a frame; `process` is asked once per sender.
+    /// Enters a frame; `process` is asked once per sender. Returns the sender's process, where it is known.
     pub fn enter(
         &mut self,
         header: &FrameHeader,
         origin: u128,
         refusal: Refusal,
         process: impl FnOnce() -> Option<u32>,
-    ) {
+    ) -> Option<u32> {
         let claim = Claim::of(header);
         let full = self.accounts.len() >= MAX_ACCOUNTS;
         let known = self.accounts.iter_mut().find(|a| a.origin == origin && a.claim == claim);
@@ -133,12 +133,7 @@ impl Refusals {
         };
         account.frames += 1;
         account.last = refusal;
-    }
-
-    /// The last refusal of a sender that claimed this place.
-    pub fn last_of(&self, role: Role, index: u16) -> Option<&Refusal> {
-        let claim = Claim { role: role as u16, index };
-        self.accounts.iter().rev().find(|a| a.claim == claim).map(|a| &a.last)
+        account.process_id
     }
 
     /// All of it.

@@ -63,7 +63,7 @@ where
     /// Refused frames, held for a while so that their senders are passed over in favour of others.
     detained: (Vec<M::Frame>, Vec<A::Frame>),
     /// Whoever has sent something it should not have in this step, in its own name.
-    suspect: Option<(Role, u16)>,
+    suspect: Option<(Role, u16, Refusal)>,
     header: FrameHeader,
     /// Controllers for which the world put in commands in the present step, or the last one.
     put_in: u64,
@@ -208,11 +208,10 @@ where
 
     /// Who is waited for and has sent something it should not have in this step: its name and the fault.
     pub fn suspect(&self) -> Option<(String, &Refusal)> {
-        let (role, index) = self.suspect?;
+        let (role, index, refusal) = self.suspect.as_ref()?;
         let Phase::Collect(missing) = self.phase else { return None };
-        let mask = if role == Role::Coordinator { missing.coordination } else { missing.commands };
-        let refusal = self.refusals.last_of(role, index).filter(|_| mask >> index & 1 == 1)?;
-        Some((format!("{role} {index}"), refusal))
+        let mask = if *role == Role::Coordinator { missing.coordination } else { missing.commands };
+        (mask >> index & 1 == 1).then(|| (format!("{role} {index}"), refusal))
     }
 
     /// What a process needs that takes a place now. `None` when that is not known yet (a controller must
@@ -454,14 +453,17 @@ where
     }
 
     fn refuse(&mut self, role: Role, header: &FrameHeader, origin: u128, refusal: Refusal) {
-        if !matches!(refusal, Refusal::Stranger { .. }) && header.sender_role == role as u16 {
-            self.suspect = Some((role, header.sender_index));
-        }
         let ports = &self.ports;
-        self.refusals.enter(header, origin, refusal, || match role {
+        let process_id = self.refusals.enter(header, origin, refusal.clone(), || match role {
             Role::Coordinator => ports.coordination.as_ref().and_then(|inbox| inbox.process_of(origin)),
             _ => ports.command.process_of(origin),
         });
+        // Whoever errs in its own name; strangers may claim what they like.
+        let seats = if role == Role::Coordinator { &self.coordinators } else { &self.controllers };
+        let own = seats.iter().zip(0..).find(|(seat, _)| seat.process_id == process_id);
+        if let Some((_, index)) = own {
+            self.suspect = Some((role, index, refusal));
+        }
     }
 }
 

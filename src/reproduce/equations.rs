@@ -31,7 +31,7 @@ pub const EQUATIONS: [Mapping; 37] = [
     map(
         "modelF",
         "one zone: passing order, index 0, partners",
-        &[("coordination/partners.rs", "assign"), ("world/car.rs", "LeftCar")],
+        &[("coordination/partners.rs", "assign"), ("world/role.rs", "Site")],
     ),
     map(
         "VehicleDynamics",

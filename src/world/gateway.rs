@@ -137,9 +137,9 @@ impl Gateway {
         }
     }
 
-    /// Whether commands are applied as they are.
+    /// Whether the commands of this step are applied as they are.
     pub(super) fn is_off(&self) -> bool {
-        self.mode == ShieldMode::Off
+        self.mode == ShieldMode::Off && !self.falls_back
     }
 
     pub(super) fn summary(&self) -> ShieldSummary {
@@ -328,8 +328,8 @@ impl World {
         }
     }
 
-    /// Settles what every vehicle holds over the step: what has reached it, shielded. Zones downstream first, and within a zone in passing
-    /// order, so that whoever a vehicle depends on has been settled before.
+    /// Settles what every vehicle holds over the step: what has reached it, shielded. Zones downstream first,
+    /// and within a zone in passing order, so that whoever a vehicle depends on has been settled before.
     pub(super) fn hold_all(&mut self, scenario: &Scenario, dt_s: f64) {
         if let Some(faults) = self.faults.as_mut().filter(|faults| faults.has_channels()) {
             let time_s = scenario.time_s(self.step);

@@ -32,7 +32,7 @@ impl World {
         let now_s = scenario.time_s(self.step);
         // Where vehicles in zones depend on nobody's command but their own, each zone settles what they hold
         // as its turn comes: what is downstream of it has not moved yet.
-        let alone = self.on_links == 0 && self.gateway.is_off();
+        let alone = self.on_links == 0 && self.gateway.is_off() && self.faults.is_none();
         if !alone {
             self.hold_all(&scenario, dt_s);
         }
