@@ -51,7 +51,7 @@ pub const EQUATIONS: [Mapping; 37] = [
     map(
         "SafeMerging",
         "merging safety b2 and its row, φ₂ = φ/L",
-        &[("vehicle/safety.rs", "Merge"), ("world/integrate.rs", "leave_zone")],
+        &[("vehicle/safety.rs", "Merge"), ("world/integrate.rs", "cross")],
     ),
     map(
         "VehicleConstraints",
