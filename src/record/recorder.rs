@@ -245,6 +245,8 @@ fn write(
     let failed = |steps, source: WriteError| RecordError::Write { steps, source };
     let mut writer = Writer::new(BufWriter::with_capacity(BUFFER, out), metadata)
         .map_err(|source| failed(0, source.into()))?;
+    // At once: a file without its head says nothing, however little of the run is in it.
+    writer.flush().map_err(|source| failed(0, source.into()))?;
     let mut flushed = Instant::now();
     loop {
         let message = inbox.recv_timeout(FLUSH_EVERY);

@@ -118,7 +118,7 @@ pub const EQUATIONS: [Mapping; 37] = [
         "feedback on the vehicles downstream",
         &[
             ("coordination/flow.rs", "terminal"),
-            ("coordination/coordinator.rs", "summarise"),
+            ("coordination/summaries.rs", "summarise"),
             ("control/law.rs", "mean_optimal_terminal_speed_mps"),
             ("control/reference.rs", "optimal_terminal_speed_mps"),
         ],
