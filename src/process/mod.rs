@@ -1,7 +1,9 @@
 //! The processes of a run: thin shells that give the pure roles a clock, signals and a transport.
 
 mod attach;
+mod house;
 mod observe;
+mod outcome;
 mod pace;
 mod participant;
 mod peers;
@@ -9,24 +11,26 @@ mod placement;
 pub mod plugin_check;
 mod realtime;
 mod run_spec;
+mod services;
 mod stop;
 mod wait;
 mod world;
 
 pub use attach::{Attachment, Joining};
 pub use observe::Observation;
+pub use outcome::{LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, new_histogram};
 pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers};
 pub use placement::{Affinity, Placement, place, unplaced};
 pub use realtime::{Held, Settled, Settling};
 pub use run_spec::plugin_bytes;
+pub use services::expected_vehicles;
 pub use stop::StopFlag;
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
-    LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, WorldOptions, check_cores,
-    expected_vehicles, first_missing_step, new_histogram, new_run_id, run_in_process,
-    run_in_process_observed, run_on_in_process, run_world,
+    WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process, run_in_process_observed,
+    run_on_in_process, run_world,
 };
 
 use crate::lockstep::{Awaited, LockstepError};

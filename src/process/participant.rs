@@ -1,7 +1,7 @@
 //! The coordinator and controller processes.
 
+use super::services::{controller_ropes, coordinator_rope, expected_vehicles};
 use super::wait::Participant;
-use super::world::{controller_ropes, coordinator_rope, expected_vehicles};
 use super::{Attachment, Joining, Patience, ProcessError, Settling, StopFlag, WaitMode, Waiter};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;

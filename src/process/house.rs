@@ -1,0 +1,136 @@
+//! Who is in a run, and who comes and goes; what the world does while it waits for them.
+
+use super::attach::{Readiness, Reception};
+use super::pace::Pacer;
+use super::services::Driver;
+use super::{OnMiss, Peer, Peers, ProcessError, Replacement, StopFlag, Waiter};
+use crate::lockstep::Awaited;
+use ipc_schemas::Role;
+use std::time::Duration;
+
+/// Longest sleep between two looks at signals and newcomers while a step is not due.
+const LONGEST_SLEEP: Duration = Duration::from_millis(5);
+/// A participant that has sent a bad frame may take this long to send a good one.
+const SECOND_CHANCE: Duration = Duration::from_secs(1);
+/// Newcomers are seen to when a wait takes longer than this.
+const ATTEND_AFTER: Duration = Duration::from_millis(1);
+
+/// Who is in the run, and who comes and goes.
+#[derive(Debug)]
+pub(super) struct House {
+    pub reception: Reception,
+    pub replace: bool,
+    pub pacer: Pacer,
+    /// The step's deadline has passed, and this is the verdict of what is put in for whoever is missing.
+    pub overdue: Option<u16>,
+    /// Who has died last and was not replaced yet.
+    pub gone: Option<Peer>,
+    /// Who has come since the last step ended.
+    pub arrived: Vec<(Peer, u32)>,
+}
+
+impl House {
+    /// Waits until the present step is due.
+    pub(super) fn begin_step(
+        &mut self,
+        driver: &mut Driver,
+        waiter: &mut Waiter,
+        stop: &StopFlag,
+    ) -> Result<(), ProcessError> {
+        let step = driver.world().step();
+        while let Some(left) = self.pacer.until(step) {
+            if stop.is_set() {
+                return Err(ProcessError::Interrupted { step: Some(step) });
+            }
+            if left.is_zero() {
+                std::hint::spin_loop();
+            } else {
+                std::thread::sleep(left.min(LONGEST_SLEEP));
+                self.attend(driver, waiter)?;
+            }
+        }
+        self.pacer.begin(step);
+        Ok(())
+    }
+
+    /// Waits a little; sees to newcomers when it takes long.
+    pub(super) fn wait(
+        &mut self,
+        driver: &mut Driver,
+        waiter: &mut Waiter,
+        awaited: Awaited,
+    ) -> Result<(), ProcessError> {
+        if self.pacer.has_missed(&awaited) {
+            match self.pacer.on_miss() {
+                OnMiss::Abort => return Err(ProcessError::DeadlineMissed { awaited }),
+                policy => self.overdue = policy.verdict(),
+            }
+        }
+        // While a coordinator is missing too, there is nothing the vehicles could go by.
+        if let Some(verdict) = self.overdue
+            && driver.put_in(verdict)?
+        {
+            self.overdue = None;
+            return Ok(());
+        }
+        if driver.expects_requests() {
+            self.attend(driver, waiter)?;
+        }
+        if waiter.waited() >= ATTEND_AFTER {
+            self.attend(driver, waiter)?;
+            if waiter.waited() >= SECOND_CHANCE
+                && let Some((who, fault)) = driver.suspect()
+            {
+                return Err(ProcessError::Faulty { who, fault: fault.clone() });
+            }
+        }
+        match (waiter.wait(awaited), self.gone) {
+            (Err(ProcessError::PeerGone { peer, .. }), _) if self.may_be_replaced(peer) => {
+                self.gone = Some(peer);
+                let others = self.reception.peers().0.into_iter().filter(|p| *p != peer);
+                waiter.set_peers(Peers(others.collect()));
+                Ok(())
+            }
+            (Err(ProcessError::Timeout { awaited, seconds }), Some(peer)) => {
+                let consequence =
+                    format!("nobody took its place within {seconds} s of waiting for {awaited}");
+                Err(ProcessError::PeerGone { peer, consequence })
+            }
+            (result, _) => result,
+        }
+    }
+
+    fn may_be_replaced(&self, peer: Peer) -> bool {
+        let is_plugin = peer.role == Role::Controller && self.reception.is_plugin(peer.index as usize);
+        self.replace && !is_plugin
+    }
+
+    /// Sees to whoever has come.
+    pub(super) fn attend(&mut self, driver: &mut Driver, waiter: &mut Waiter) -> Result<(), ProcessError> {
+        let House { reception, arrived, gone, .. } = self;
+        (reception.under_way, reception.first_step) = (true, driver.world().step());
+        let before = arrived.len();
+        reception.serve(&mut |role, index, seat| {
+            driver.seat(role, index, seat);
+            let Some(handover) = driver.handover(role, index) else { return Readiness::Later };
+            if let Some(process_id) = seat.process_id {
+                arrived.push((Peer { role, index, process_id }, seat.generation));
+            }
+            Readiness::Now(Box::new(handover))
+        })?;
+        if arrived.len() > before {
+            *gone = None;
+            waiter.set_peers(reception.peers());
+        }
+        Ok(())
+    }
+
+    /// The replacements of a step that took so long.
+    pub(super) fn step_done(&mut self, ns: u64) -> impl Iterator<Item = Replacement> + '_ {
+        let step = self.reception.first_step;
+        let step_ms = ns as f64 / 1e6;
+        self.arrived.drain(..).filter(|(_, generation)| *generation > 0).map(move |(peer, generation)| {
+            Replacement { participant: peer.to_string(), generation, step, step_ms }
+        })
+    }
+}

@@ -1,0 +1,141 @@
+//! The services and bells of a run, as its world creates them.
+
+use super::WaitMode;
+use crate::lockstep::{WorldDriver, WorldPorts};
+use crate::scenario::Scenario;
+use crate::scenario::share::neighbour_coordinators;
+use crate::transport::iox::{
+    BellRope, BellService, IoxInbox, IoxOutbox, RunSpace, Service, ServiceLimits, SpaceError,
+};
+use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+
+/// The world's ends of the services.
+pub(super) type Ports = WorldPorts<
+    IoxOutbox<VehicleState>,
+    IoxOutbox<VehicleState>,
+    IoxInbox<VehicleCommand>,
+    IoxInbox<Assignment>,
+>;
+/// The world in a run of several processes.
+pub(super) type Driver = WorldDriver<
+    IoxOutbox<VehicleState>,
+    IoxOutbox<VehicleState>,
+    IoxInbox<VehicleCommand>,
+    IoxInbox<Assignment>,
+>;
+
+/// Room for sending ends that belong to nobody in the run: what they send is counted and refused.
+const STRANGERS: usize = 2;
+
+/// All frame services of a run, created by its world and kept open by it.
+#[derive(Debug)]
+pub(super) struct Services {
+    state: Service<VehicleState>,
+    coordinator_states: Vec<Service<VehicleState>>,
+    command: Service<VehicleCommand>,
+    coordination: Service<Assignment>,
+    /// Whether the world listens to coordination too.
+    keeps: bool,
+    _summaries: Vec<Service<ZoneSummary>>,
+    controllers: u32,
+}
+
+impl Services {
+    pub(super) fn create(
+        space: &RunSpace,
+        scenario: &Scenario,
+        (coordinators, controllers): (u32, u32),
+        keeps: bool,
+    ) -> Result<Services, SpaceError> {
+        let (m, n) = (coordinators as usize, controllers as usize);
+        // Strangers may try; they shall not keep anybody out who belongs here.
+        let nodes = 1 + m + n + STRANGERS;
+        let limits = |publishers, subscribers| ServiceLimits { publishers, subscribers, nodes };
+        let masks = neighbour_coordinators(&scenario.network, coordinators);
+        Ok(Services {
+            controllers,
+            state: space.create(frames::SERVICE_STATE, limits(1, n))?,
+            coordinator_states: (0..m)
+                .map(|i| {
+                    let name = format!("{}{i}", frames::SERVICE_COORDINATOR_STATE_PREFIX);
+                    space.create(&name, limits(1, 1))
+                })
+                .collect::<Result<_, _>>()?,
+            command: space.create(frames::SERVICE_COMMAND, limits(n + STRANGERS, 1))?,
+            coordination: space
+                .create(frames::SERVICE_COORDINATION, limits(m + STRANGERS, n + usize::from(keeps)))?,
+            keeps,
+            _summaries: (0..m)
+                .map(|i| {
+                    let name = format!("{}{i}", frames::SERVICE_SUMMARY_PREFIX);
+                    space.create(&name, limits((masks[i].count_ones() as usize).max(1), 1))
+                })
+                .collect::<Result<_, _>>()?,
+        })
+    }
+
+    pub(super) fn world_ports(
+        &self,
+        space: &RunSpace,
+        scenario: &Scenario,
+        wait: WaitMode,
+    ) -> Result<Ports, SpaceError> {
+        let expected = expected_vehicles(scenario);
+        Ok(WorldPorts {
+            state: self.state.outbox(expected)?.ringing(controller_ropes(space, wait, self.controllers)),
+            coordinator_states: self
+                .coordinator_states
+                .iter()
+                .zip(0..)
+                .map(|(s, i)| Ok(s.outbox(expected)?.ringing(coordinator_rope(space, wait, i))))
+                .collect::<Result<_, SpaceError>>()?,
+            command: self.command.inbox()?,
+            coordination: if self.keeps { Some(self.coordination.inbox()?) } else { None },
+        })
+    }
+}
+
+/// Creates the bells of all who sleep under this mode.
+pub(super) fn create_bells(
+    space: &RunSpace,
+    wait: WaitMode,
+    coordinators: u32,
+    controllers: u32,
+) -> Result<Vec<BellService>, SpaceError> {
+    let (m, n) = (coordinators as usize, controllers as usize);
+    let mut bells = Vec::new();
+    if wait.has_bell(Role::World) {
+        bells.push(space.create_bell(frames::BELL_WORLD, n)?);
+    }
+    if wait.has_bell(Role::Coordinator) {
+        for i in 0..coordinators {
+            bells.push(space.create_bell(&format!("{}{i}", frames::BELL_COORDINATOR_PREFIX), m)?);
+        }
+    }
+    if wait.has_bell(Role::Controller) {
+        for i in 0..controllers {
+            bells.push(space.create_bell(&format!("{}{i}", frames::BELL_CONTROLLER_PREFIX), 1 + m)?);
+        }
+    }
+    Ok(bells)
+}
+
+/// The ropes of all controllers' bells, when they have any.
+pub(super) fn controller_ropes(space: &RunSpace, wait: WaitMode, controllers: u32) -> Vec<BellRope> {
+    let count = if wait.has_bell(Role::Controller) { controllers } else { 0 };
+    (0..count).filter_map(|i| space.bell_rope(&format!("{}{i}", frames::BELL_CONTROLLER_PREFIX))).collect()
+}
+
+/// The rope of a coordinator's bell, when it has one.
+pub(super) fn coordinator_rope(space: &RunSpace, wait: WaitMode, index: u32) -> Option<BellRope> {
+    let rope = || space.bell_rope(&format!("{}{index}", frames::BELL_COORDINATOR_PREFIX));
+    wait.has_bell(Role::Coordinator).then(rope).flatten()
+}
+
+/// About as many vehicles as the network holds in dense but moving traffic. Frames may be longer; this
+/// only decides how much memory is laid out at first.
+pub fn expected_vehicles(scenario: &Scenario) -> usize {
+    const DENSE_SPACING_M: f64 = 12.0;
+    let lengths = scenario.network.zones.iter().flat_map(|z| z.approaches.iter().map(|a| a.length_m));
+    lengths.map(|l| (l / DENSE_SPACING_M).ceil() as usize + 2).sum()
+}
