@@ -7,8 +7,8 @@ use super::{
 };
 use crate::record::{CommandPart, POLICY_NONE, StepFrames};
 use crate::scenario::share::zones_of;
-use crate::transport::{Frame, Inbox, Loan, Outbox};
-use crate::world::World;
+use crate::transport::{Frame, Inbox, Loan, Outbox, Slots};
+use crate::world::{Sheet, World};
 use ipc_schemas::{
     Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, HeaderFault, Role, VehicleCommand,
     VehicleState, ZoneSummary,
@@ -274,9 +274,7 @@ where
         }
         let world = &mut self.world;
         let count = world.record_count();
-        let loan = self.ports.state.loan(header, count, |slots| {
-            world.publish(|records| slots.extend_from_slice(records));
-        })?;
+        let loan = self.ports.state.loan(header, count, |slots| world.publish(slots))?;
         if self.observer.is_some() {
             self.published.clear();
             self.published.extend_from_slice(loan.records());
@@ -464,6 +462,16 @@ where
         if let Some((_, index)) = own {
             self.suspect = Some((role, index, refusal));
         }
+    }
+}
+
+impl Sheet for Slots<'_, VehicleState> {
+    fn push(&mut self, record: VehicleState) {
+        self.push(record);
+    }
+
+    fn written(&self) -> &[VehicleState] {
+        self.written()
     }
 }
 

@@ -101,16 +101,11 @@ impl<'a, R: Record> Slots<'a, R> {
         self.filled += 1;
     }
 
-    /// Writes the next records.
-    ///
-    /// # Panics
-    /// When there are fewer left to write.
-    pub fn extend_from_slice(&mut self, records: &[R]) {
-        let slots = &mut self.slots[self.filled..self.filled + records.len()];
-        for (slot, record) in slots.iter_mut().zip(records) {
-            slot.write(*record);
-        }
-        self.filled += records.len();
+    /// The records written so far.
+    pub fn written(&self) -> &[R] {
+        // SAFETY: `push` alone raises `filled`, by one, after it has written the slot there; a slot has the layout
+        // of what it holds.
+        unsafe { std::slice::from_raw_parts(self.slots.as_ptr().cast(), self.filled) }
     }
 
     fn assert_full(&self) {

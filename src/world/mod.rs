@@ -13,4 +13,4 @@ mod role;
 pub use change::ChangeError;
 pub use gateway::CommandFault;
 pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
-pub use role::{CoordinatorMasks, World};
+pub use role::{CoordinatorMasks, Sheet, World};

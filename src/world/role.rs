@@ -78,20 +78,26 @@ impl Site {
     }
 }
 
-/// Records handed out at a time, and what the zone at the end has more: few enough for the innermost cache.
+/// Records hashed at a time, and what the zone at the end has more: few enough for the innermost cache.
 const BATCH: usize = 128;
 
 /// Lists that live for a part of a step; kept for their allocations.
 #[derive(Debug, Default)]
 pub(super) struct Scratch {
-    /// Records about to be handed out.
-    batch: Vec<VehicleState>,
     /// Motion of each car of a zone over the step.
     pub motions: Vec<Held>,
     /// Vehicles about to enter a zone.
     pub entries: Vec<Entry>,
     /// What newcomers on a road find ahead of them.
     pub leaders: Vec<Leader>,
+}
+
+/// Where the records of a state frame are written, in order.
+pub trait Sheet {
+    /// Writes the next.
+    fn push(&mut self, record: VehicleState);
+    /// What has been written.
+    fn written(&self) -> &[VehicleState];
 }
 
 #[derive(Debug)]
@@ -141,7 +147,7 @@ impl World {
             metrics: vec![ZoneMetrics::default(); zones],
             visits: None,
             events: Vec::new(),
-            scratch: Scratch { batch: Vec::with_capacity(2 * BATCH), ..Scratch::default() },
+            scratch: Scratch::default(),
             state_hash: 0,
             coordinators: shares,
             neighbours,
@@ -284,33 +290,27 @@ impl World {
         }
     }
 
-    /// Hands out the records of the present state frame, some at a time, and chains them into the state hash:
+    /// Writes the records of the present state frame and chains them into the state hash:
     /// [`records`](Self::records) and [`seal`](Self::seal) in one, while what is written is near.
-    pub fn publish(&mut self, mut emit: impl FnMut(&[VehicleState])) {
-        let mut batch = std::mem::take(&mut self.scratch.batch);
+    pub fn publish(&mut self, sheet: &mut impl Sheet) {
         if self.record_count() <= BATCH || self.sensor_faults().is_some() {
-            batch.extend(self.records());
-            emit(&batch);
-            self.seal(&batch);
-            batch.clear();
-        } else {
-            let mut hash = Xxh3::with_seed(self.state_hash);
-            let mut hand_out = |batch: &mut Vec<VehicleState>| {
-                hash.update(frames::bytes_of(batch));
-                emit(batch);
-                batch.clear();
-            };
-            for zone in 0..self.sites.len() as ZoneId {
-                batch.extend(self.zone_records(zone));
-                if batch.len() >= BATCH {
-                    hand_out(&mut batch);
-                }
-            }
-            batch.extend(self.link_records());
-            hand_out(&mut batch);
-            self.state_hash = hash.digest();
+            self.records().for_each(|record| sheet.push(record));
+            self.seal(sheet.written());
+            return;
         }
-        self.scratch.batch = batch;
+        let mut hash = Xxh3::with_seed(self.state_hash);
+        let mut hashed = 0;
+        for zone in 0..self.sites.len() {
+            self.zone_records(zone as ZoneId).for_each(|record| sheet.push(record));
+            let new = &sheet.written()[hashed..];
+            if new.len() >= BATCH {
+                hash.update(frames::bytes_of(new));
+                hashed += new.len();
+            }
+        }
+        self.link_records().for_each(|record| sheet.push(record));
+        hash.update(frames::bytes_of(&sheet.written()[hashed..]));
+        self.state_hash = hash.digest();
     }
 
     /// Chains a published state frame into the state hash.
