@@ -43,7 +43,8 @@ fn states_are_the_same_and_every_process_says_what_it_got() {
                 assert!(scheduling == fifo || scheduling.contains("(SCHED_FIFO "), "{got}");
                 assert!(got["memory_locked"] == true || got["memory_note"].is_string(), "{got}");
             } else {
-                assert!(!scheduling.contains("FIFO"), "{got}");
+                let ordinary = if process == "coordinator 0" { "SCHED_BATCH" } else { "SCHED_OTHER" };
+                assert_eq!(scheduling, ordinary, "{got}");
                 assert_eq!(got["memory_locked"], false, "{got}");
             }
         }

@@ -9,7 +9,9 @@ use super::placement::{cores, number_of_cores};
 use super::{Placement, WaitMode, place};
 use ipc_schemas::Role;
 use rustix::mm::{MlockAllFlags, mlockall};
-use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use rustix::process::{
+    Resource, Rlimit, getpriority_process, getrlimit, setpriority_process, setrlimit,
+};
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 use thread_priority::{
@@ -72,6 +74,11 @@ impl Settling<'_> {
             (memory_locked, memory_note) = lock_memory();
         }
         let refusal = if self.realtime { ask_for_fifo(role, wait, hot_processes).err() } else { None };
+        if !self.realtime && role == Role::Coordinator && wait == WaitMode::Hybrid {
+            // A controller that waits for it yields. So its waking need not interrupt the core, which takes longer
+            // than the next yield is away.
+            schedule(NormalThreadSchedulePolicy::Batch);
+        }
         let scheduling = match refusal {
             Some(why) => format!("{} ({why})", scheduling()),
             None => scheduling(),
@@ -94,11 +101,20 @@ pub struct Held(());
 impl Drop for Held {
     fn drop(&mut self) {
         if is_fifo() {
-            let other = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
-            // Giving up is always allowed. 49 of 99 is what the library makes niceness 0 of.
-            let ordinary = ThreadPriority::Crossplatform(49.try_into().expect("priorities are below 100"));
-            let _ = set_thread_priority_and_policy(thread_native_id(), ordinary, other);
+            schedule(NormalThreadSchedulePolicy::Other);
         }
+    }
+}
+
+/// Puts the calling thread under a policy that is not real-time, which is always allowed, as nice as it is.
+fn schedule(policy: NormalThreadSchedulePolicy) {
+    let niceness = getpriority_process(None);
+    // The library always sets niceness too, and makes 0 of 49 of 99: the way back from there is open to all but
+    // who was not nice at all.
+    let ordinary = ThreadPriority::Crossplatform(49.try_into().expect("priorities are below 100"));
+    let _ = set_thread_priority_and_policy(thread_native_id(), ordinary, ThreadSchedulePolicy::Normal(policy));
+    if let Ok(niceness) = niceness {
+        let _ = setpriority_process(None, niceness);
     }
 }
 
