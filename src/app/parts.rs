@@ -6,8 +6,8 @@ use super::report::{Summary, Transport};
 use super::supervise::{SettledLine, WorldLine};
 use super::{AppError, record};
 use crate::process::{
-    Joining, Observation, Settled, Settling, StopFlag, WorldOptions, new_run_id, run_controller,
-    run_coordinator, run_world,
+    Joining, Observation, Settled, Settling, StopFlag, WorldOptions, first_missing_step, new_run_id,
+    run_controller, run_coordinator, run_world,
 };
 use crate::scenario::scenario_hash;
 use crate::world::World;
@@ -31,7 +31,12 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     let run_id = args.run_id.unwrap_or_else(new_run_id);
     let observation = match &args.record {
         Some(path) => {
-            let recording = Recording::start(path, &args.scenario, &scenario, share, run_id)?;
+            let recording = match (&resume, &args.resume) {
+                (Some(reader), Some(from)) => {
+                    Recording::continuation(path, reader, from, first_missing_step(reader), run_id)?
+                }
+                _ => Recording::start(path, &args.scenario, &scenario, share, run_id)?,
+            };
             let push = |r: &mut Recording, step, block: &[u8]| r.push_block(step, block);
             Some(Observation::start(args.run.clone(), recording, push))
         }

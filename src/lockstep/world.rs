@@ -137,6 +137,12 @@ where
         self.ledger = ledger;
     }
 
+    /// Goes on from a recording in whose last step commands were put in: the next state says so, as it would
+    /// have without the interruption.
+    pub fn go_on_after_miss(&mut self) {
+        self.put_in = mask_of(self.controllers.len() as u32);
+    }
+
     /// The world as it stands.
     pub fn world(&self) -> &World {
         &self.world
