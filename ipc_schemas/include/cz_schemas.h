@@ -381,8 +381,8 @@ typedef struct cz_vehicle_command {
     uint32_t binding_rows;
     /** Memory: 0 entered, 1 FE, 2 OCBF. */
     uint16_t mode;
-    /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; put in by the world when a deadline was
-     *  missed: 4 held, 5 held within what the shield allows. */
+    /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a deadline was
+     *  missed, and refused from a controller: 4 held, 5 held within what the shield allows. */
     uint16_t verdict;
 } cz_vehicle_command_t;
 CZ_ASSERT_(vehicle_command_size, sizeof(cz_vehicle_command_t) == 96);

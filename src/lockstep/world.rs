@@ -183,7 +183,7 @@ where
         }
         for index in (0..self.controllers.len()).filter(|i| missing.commands >> i & 1 == 1) {
             let commands = self.world.substitute(index as u32, ledger.commands_before(index), verdict);
-            self.world.command(index as u32, &commands).expect(
+            self.world.put_in(index as u32, &commands).expect(
                 "what the world puts in has each of the controller's vehicles once, within its limits",
             );
             ledger.substitute(index, commands);
