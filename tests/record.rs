@@ -544,6 +544,32 @@ fn a_full_disk_is_an_error_at_the_end_and_stops_nobody() {
 }
 
 #[test]
+fn a_recording_of_another_version_is_refused_by_all_who_read_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("old.czlog");
+    let name = file.to_str().unwrap();
+    for (found, version) in [(1_u32, "1"), (3, "3"), (u32::MAX, "4294967295")] {
+        let mut bytes = small().bytes;
+        bytes[8..12].copy_from_slice(&found.to_le_bytes());
+        std::fs::write(&file, &bytes).unwrap();
+        for arguments in [
+            &["show", name][..],
+            &["verify", name, name],
+            &["replay", name],
+            &["resume", name],
+            &["branch", name, "--at", "5", "--set", "objective.beta=1.0"],
+        ] {
+            let output = Site::new("old").command("cz").args(arguments).output().unwrap();
+            let said = String::from_utf8(output.stderr).unwrap();
+            let expected = format!(
+                "cz: {name}: the recording has format version {version}, this program reads version 2\n"
+            );
+            assert_eq!((output.status.code(), said), (Some(2), expected), "{arguments:?}");
+        }
+    }
+}
+
+#[test]
 fn the_commands_tell_what_is_in_a_file() {
     let site = Site::new("rec");
     let directory = tempfile::tempdir().unwrap();

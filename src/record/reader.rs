@@ -69,7 +69,7 @@ pub enum OpenError {
     #[error("not a recording: it does not begin as a .czlog file does")]
     NotARecording,
     /// It was written by another version of the format.
-    #[error("format version {found}; this program reads version {FORMAT_VERSION}")]
+    #[error("the recording has format version {found}, this program reads version {FORMAT_VERSION}")]
     OtherVersion {
         /// The file's.
         found: u32,
