@@ -5,6 +5,7 @@ mod bench;
 mod clean;
 mod controllers;
 mod golden;
+mod lines;
 mod parts;
 mod plan;
 mod plugin;

@@ -196,7 +196,7 @@ where
 
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
-        self.refusals.report()
+        self.refusals.report(&self.identity)
     }
 
     /// The number of answers that came too late or twice.
