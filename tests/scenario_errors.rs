@@ -108,6 +108,11 @@ fn the_base_is_valid() {
 /// Text of the base, its replacement, and the message.
 const FILE_CASES: &[(&str, &str, &str)] = &[
     (
+        "dt_s = 0.1",
+        "\"dt\\ns\" = 0.1",
+        "s.toml:3: dt\\ns = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
+    ),
+    (
         "[control]",
         "[[faults.sensors]]\nkind = \"frozen\"\nposition_m = 2\n[control]",
         "s.toml:12: faults.sensors.0.position_m = 2: unknown key; expected one of kind, zones, approaches, fraction, from_s, until_s",
@@ -492,6 +497,20 @@ const SET_CASES: &[(&str, &str)] = &[
         "faults.nose={}",
         "--set faults.nose={}: faults.nose = {...}: unknown key; expected one of noise, sensors, commands, stalls; did you mean noise?",
     ),
+    // Whatever characters there are, a message has one line.
+    (
+        "control.replan=from\nstate",
+        "--set control.replan=from\\nstate: control.replan = \"from\\nstate\": expected \"from_entry\" or \"from_state\"",
+    ),
+    (
+        "end.ti\nme_s=1",
+        "--set end.ti\\nme_s=1: end.ti\\nme_s = 1: unknown key; expected one of vehicles, time_s; did you mean time_s?",
+    ),
+    (
+        "zones.fi\r\nrst.flow=1",
+        "--set zones.fi\\r\\nrst.flow=1: zones has no element fi\\r\\nrst; expected first, second, or an index from 0 to 1; did you mean first?",
+    ),
+    ("a\u{1b}[2J", "--set a\\u{1b}[2J: no '='; expected key=value"),
     ("faults=all", "--set faults=all: faults = \"all\": expected a table"),
     (
         "faults.noise=1",

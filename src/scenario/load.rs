@@ -15,7 +15,7 @@ mod sections;
 mod table;
 mod topology;
 
-pub use error::{Place, ScenarioError};
+pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;
 
 use super::{Network, Road, Scenario, ShieldMode, embedded};

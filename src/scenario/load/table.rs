@@ -1,7 +1,8 @@
 //! Typed reading of a [`Document`]: every failure names place, key path, value found and what was expected.
 
 use super::document::{Document, Node, Origin, Value};
-use super::error::{Place, ScenarioError, nearest};
+use super::error::{Place, ScenarioError, nearest, printable};
+use crate::scenario::ranges::Range;
 use std::collections::BTreeMap;
 
 /// A table being read.
@@ -71,7 +72,8 @@ impl<'a> Table<'a> {
 
     /// Dotted path of a key of this table.
     pub(super) fn key(&self, key: &str) -> String {
-        if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
+        let key = printable(key);
+        if self.path.is_empty() { key } else { format!("{}.{key}", self.path) }
     }
 
     /// A key that may be absent.
