@@ -136,6 +136,16 @@ impl<'a> Table<'a> {
         }
     }
 
+    /// A number within a range.
+    pub(super) fn within(&self, key: &str, range: &Range) -> Result<f64, ScenarioError> {
+        self.need(key, &range.to_string())?.within(range)
+    }
+
+    /// The same, with a default.
+    pub(super) fn within_or(&self, key: &str, default: f64, range: &Range) -> Result<f64, ScenarioError> {
+        self.f64_or(key, default, |value| range.contains(value), &range.to_string())
+    }
+
     /// `true` or `false`, with a default.
     pub(super) fn bool_or(&self, key: &str, default: bool) -> Result<bool, ScenarioError> {
         match self.get(key) {
@@ -218,6 +228,11 @@ impl<'a> Field<'a> {
             _ => return Err(self.bad(expected)),
         };
         if number.is_finite() && ok(number) { Ok(number) } else { Err(self.bad(expected)) }
+    }
+
+    /// The same.
+    pub(super) fn within(&self, range: &Range) -> Result<f64, ScenarioError> {
+        self.f64(|value| range.contains(value), &range.to_string())
     }
 
     /// An integer within a range.
