@@ -8,7 +8,8 @@ use common::{Site, files, unique_name, wait_until};
 use control_zones::transport::iox::{RunName, RunSpace};
 use control_zones::transport::{Loan, Outbox};
 use ipc_schemas::{
-    Assignment, FrameHeader, Role, SERVICE_COMMAND, SERVICE_COORDINATION, VehicleCommand, schema_hash,
+    ANY_INDEX, ATTACH_BAD_PHASE, ATTACH_JOIN, ATTACH_NO_CONTROLLER, ATTACH_NO_ROOM, ATTACH_READY, Assignment,
+    AttachRequest, FrameHeader, Role, SERVICE_COMMAND, SERVICE_COORDINATION, VehicleCommand, schema_hash,
 };
 use std::process::{Child, Command, Stdio};
 
@@ -178,4 +179,58 @@ fn what_a_controller_refuses_is_in_the_summary_and_by_hand_on_stderr() {
     assert!(said.starts_with("controller 0 refused ") && said.contains(&own), "{said}");
     assert_eq!(said.lines().count(), 1, "{said}");
     assert!(world.wait_with_output().unwrap().status.success());
+}
+
+#[test]
+fn attach_requests_that_contradict_themselves_are_refused_and_end_nothing() {
+    let name = unique_name("attach");
+    let start = |program: &str| {
+        let mut command = Command::new(program);
+        command.args(["--run", &name]).stdin(Stdio::null()).stdout(Stdio::piped());
+        command.spawn().unwrap()
+    };
+    let world = start(env!("CARGO_BIN_EXE_cz-world"));
+    let run: RunName = name.parse().unwrap();
+    {
+        let space = RunSpace::enter(&run).unwrap();
+        let mut line = None;
+        wait_until("the attach desk", || {
+            line = space.open_attach_line().ok();
+            line.is_some()
+        });
+        let line = line.unwrap();
+        let good = AttachRequest {
+            instance: 1,
+            schema_hash: schema_hash(),
+            process_id: std::process::id(),
+            role: Role::Coordinator as u16,
+            wanted_index: ANY_INDEX,
+            phase: ATTACH_JOIN,
+            ..AttachRequest::default()
+        };
+        let cases = [
+            // A coordinator that gives a controller's name.
+            (AttachRequest { controller: 123, ..good }, ATTACH_NO_CONTROLLER),
+            (AttachRequest { phase: 9, ..good }, ATTACH_BAD_PHASE),
+            // Ready without having joined.
+            (AttachRequest { phase: ATTACH_READY, ..good }, ATTACH_NO_ROOM),
+        ];
+        for (i, (request, status)) in (10..).zip(cases) {
+            let request = AttachRequest { instance: i, ..request };
+            line.request(request).unwrap();
+            wait_until("the reply", || {
+                assert!(common::is_alive(world.id()), "{request:?} has ended the world");
+                let reply = line.next_reply().unwrap();
+                reply.is_some_and(|frame| {
+                    assert_eq!((frame.reply().instance, frame.reply().status), (i, status));
+                    !frame.scenario().is_empty()
+                })
+            });
+        }
+    }
+    let mut parts = [env!("CARGO_BIN_EXE_cz-coord"), env!("CARGO_BIN_EXE_cz-ctrl")].map(start);
+    let output = world.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success() && said.contains("4bd61fbe17f858e7"), "{said}");
+    assert!(parts.iter_mut().all(|part| part.wait().unwrap().success()));
 }

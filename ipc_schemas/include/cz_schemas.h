@@ -125,6 +125,8 @@
 #define CZ_ATTACH_NO_CONTROLLER UINT32_C(5)
 /** `cz_attach_reply_t.status`: the run is under way and does without newcomers. */
 #define CZ_ATTACH_UNDER_WAY UINT32_C(6)
+/** `cz_attach_reply_t.status`: the request names a phase there is not. */
+#define CZ_ATTACH_BAD_PHASE UINT32_C(7)
 
 /** `cz_approach_spec_t.flags`: the controller that asked drives this approach. */
 #define CZ_APPROACH_OWN UINT32_C(1)

@@ -101,6 +101,8 @@ ATTACH_BAD_ROLE = 4
 ATTACH_NO_CONTROLLER = 5
 #: `AttachReply.status`: the run is under way and does without newcomers.
 ATTACH_UNDER_WAY = 6
+#: `AttachReply.status`: the request names a phase there is not.
+ATTACH_BAD_PHASE = 7
 
 #: `ApproachSpec.flags`: the controller that asked drives this approach.
 APPROACH_OWN = 1

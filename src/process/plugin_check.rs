@@ -307,7 +307,7 @@ impl Kit<'_> {
                 // What it had sent, if anything, is of the past.
                 while self.commands.receive()?.is_some() {}
                 self.reception.vacate(INDEX as usize);
-                (self.reception.under_way, self.reception.first_step) = (true, step);
+                self.reception.go_on_from(step);
                 self.start()?;
                 if !self.admit(Rule::Restart)? {
                     return Ok(());
