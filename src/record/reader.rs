@@ -276,35 +276,30 @@ impl<S: Source> Reader<S> {
         gaps
     }
 
-    /// One step; `None` when the file does not have it.
+    /// One step; `None` when the file does not have it. Refused exactly when it is damaged itself, or not the
+    /// one that was written behind the step before it.
     pub fn step(&self, step: u64) -> Result<Option<Step>, Damage> {
         let Ok(at) = self.steps.binary_search_by_key(&step, |entry| entry.step) else { return Ok(None) };
-        let entry = self.steps[at];
-        let after = at.checked_sub(1).map(|before| self.steps[before].step);
-        let damage = |flaw| Damage { offset: entry.offset, after, flaw };
-        let read = || -> Result<Step, Flaw> {
-            let (block, seal, _) = self.block(entry.offset)?;
-            // The link before this block ends where the block begins.
-            let link = if entry.offset == self.first {
-                self.first_link
-            } else {
-                let before = entry.offset.checked_sub(size_of::<Digest>() as u64);
-                let before = before.filter(|at| *at >= self.first).ok_or(Flaw::Chain)?;
-                fixed(&self.source, before).map_err(io_flaw)?.ok_or(Flaw::CutOff)?
-            };
-            // After a damaged place there may be no link to compare with.
-            let tied = !self.damage.iter().any(|(steps, _)| *steps == at);
-            if tied && next_link(&link, &seal.digest) != seal.link {
-                return Err(Flaw::Chain);
+        // The one before tells what this one must follow, if it is sound, which the one before that tells.
+        let mut steps = self.steps_from(at.saturating_sub(2));
+        while let Some(read) = steps.next() {
+            if steps.next > at {
+                return read.map(Some);
             }
-            numbered(&block, entry.step)
-        };
-        read().map(Some).map_err(damage)
+        }
+        Ok(None)
     }
 
     /// All steps in order, and between them every place where the file is damaged.
     pub fn steps(&self) -> Steps<'_, S> {
-        Steps { reader: self, next: 0, damage: 0, at: self.first, link: Some(self.first_link), ended: false }
+        self.steps_from(0)
+    }
+
+    /// The same from one of the steps on; of that one it is not known what it must follow.
+    fn steps_from(&self, next: usize) -> Steps<'_, S> {
+        let (at, link) = if next == 0 { (self.first, Some(self.first_link)) } else { (u64::MAX, None) };
+        let damage = self.damage.partition_point(|(before, _)| *before < next);
+        Steps { reader: self, next, damage, at, link, ended: false }
     }
 
     /// Uses the index at the end of the file; `false` when there is none, or none that is sound.
