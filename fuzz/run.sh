@@ -12,7 +12,7 @@ seconds=${1:-60}
 shift || true
 targets=("$@")
 if ((${#targets[@]} == 0)); then
-    targets=(czlog scenario trace frames)
+    targets=(czlog scenario trace frames attach)
 fi
 
 sancov=(

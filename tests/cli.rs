@@ -40,6 +40,24 @@ fn version() {
 }
 
 #[test]
+fn a_refusal_is_one_line_whatever_was_given() {
+    for arguments in [
+        &["run", "--set", "dt_s=1\n2"][..],
+        &["run", "--set", "no\nkey=1"],
+        &["run", "no\nsuch"],
+        &["run", "no/such\r\nfile.toml"],
+        &["run", "--controller", "merge\n-1=true"],
+        &["world", "--run", "r", "--set", "seed=\u{1b}[2J\n"],
+        &["show", "no\nsuch.czlog"],
+        &["branch", "no\nsuch.czlog", "--at", "1", "--set", "a\n=1"],
+    ] {
+        let said = refusal(arguments);
+        assert!(said.ends_with('\n') && said.lines().count() == 1, "{arguments:?}: {said}");
+        assert!(said.trim_end().chars().all(|c| !c.is_control()), "{arguments:?}: {said:?}");
+    }
+}
+
+#[test]
 fn help_shows_the_way() {
     let help = stdout(&["--help"]);
     for word in ["run", "world", "coord", "ctrl", "plan", "Usage: cz"] {

@@ -7,8 +7,11 @@ mod common;
 use common::{Site, files, unique_name, wait_until};
 use control_zones::transport::iox::{RunName, RunSpace};
 use control_zones::transport::{Loan, Outbox};
-use ipc_schemas::{FrameHeader, Role, SERVICE_COMMAND, VehicleCommand, schema_hash};
-use std::process::{Command, Stdio};
+use ipc_schemas::{
+    ANY_INDEX, ATTACH_BAD_PHASE, ATTACH_JOIN, ATTACH_NO_CONTROLLER, ATTACH_NO_ROOM, ATTACH_READY, Assignment,
+    AttachRequest, FrameHeader, Role, SERVICE_COMMAND, SERVICE_COORDINATION, VehicleCommand, schema_hash,
+};
+use std::process::{Child, Command, Stdio};
 
 /// Frames the hostile process sends; the run lasts until all are.
 const FRAMES: u64 = 1_000_000;
@@ -117,4 +120,117 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
     let mut kinds: Vec<_> = refused.iter().map(|r| r["last"].to_string()).collect();
     kinds.sort();
     println!("{counted} frames refused, of {} kinds of sender, e.g. {:?}", refused.len(), kinds.first());
+}
+
+/// Sends assignments of another run to whoever listens, until the process has ended.
+fn mislead(name: &str, until: &mut Child) {
+    let run: RunName = name.parse().unwrap();
+    let space = RunSpace::enter(&run).unwrap();
+    let mut service = None;
+    wait_until("the coordination service", || {
+        service = space.open::<Assignment>(SERVICE_COORDINATION).ok();
+        service.is_some()
+    });
+    let mut outbox = service.unwrap().outbox(1).unwrap();
+    let header = FrameHeader {
+        run_id: !RUN_ID,
+        schema_hash: schema_hash(),
+        sender_role: Role::Coordinator as u16,
+        ..FrameHeader::default()
+    };
+    while until.try_wait().unwrap().is_none() {
+        outbox.loan(header, 0, |_| {}).unwrap().send().unwrap();
+        std::thread::sleep(std::time::Duration::from_micros(200));
+    }
+}
+
+#[test]
+fn what_a_controller_refuses_is_in_the_summary_and_by_hand_on_stderr() {
+    const LONG: [&str; 3] = ["--set", "end.time_s=600", "varying-demand"];
+    let start = |program: &str, arguments: &[&str]| {
+        let mut command = Command::new(program);
+        command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
+        command.spawn().unwrap()
+    };
+    let own = format!("coordinator 0 (process {})", std::process::id());
+    let name = unique_name("mislead");
+    let mut supervisor =
+        start(env!("CARGO_BIN_EXE_cz"), &[&["run", "--run", &name, "--json", "-"], &LONG[..]].concat());
+    mislead(&name, &mut supervisor);
+    let output = supervisor.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let refused = summary["refused"].as_array().unwrap();
+    for receiver in ["the world", "controller 0"] {
+        let is_ours = |r: &&serde_json::Value| r["receiver"] == receiver && r["sender"] == own;
+        let account = refused.iter().find(is_ours).unwrap_or_else(|| panic!("{receiver}: {summary}"));
+        assert!(account["frames"].as_u64().unwrap() > 0, "{summary}");
+        assert!(account["last"].as_str().unwrap().contains("belongs to run"), "{summary}");
+    }
+
+    let name = unique_name("mislead");
+    let mut world = start(env!("CARGO_BIN_EXE_cz-world"), &[&["--run", &name], &LONG[..]].concat());
+    let parts =
+        [env!("CARGO_BIN_EXE_cz-coord"), env!("CARGO_BIN_EXE_cz-ctrl")].map(|p| start(p, &["--run", &name]));
+    mislead(&name, &mut world);
+    let [coordinator, controller] = parts.map(|part| part.wait_with_output().unwrap());
+    assert!(coordinator.status.success() && coordinator.stderr.is_empty(), "{coordinator:?}");
+    let said = String::from_utf8(controller.stderr).unwrap();
+    assert!(said.starts_with("controller 0 refused ") && said.contains(&own), "{said}");
+    assert_eq!(said.lines().count(), 1, "{said}");
+    assert!(world.wait_with_output().unwrap().status.success());
+}
+
+#[test]
+fn attach_requests_that_contradict_themselves_are_refused_and_end_nothing() {
+    let name = unique_name("attach");
+    let start = |program: &str| {
+        let mut command = Command::new(program);
+        command.args(["--run", &name]).stdin(Stdio::null()).stdout(Stdio::piped());
+        command.spawn().unwrap()
+    };
+    let world = start(env!("CARGO_BIN_EXE_cz-world"));
+    let run: RunName = name.parse().unwrap();
+    {
+        let space = RunSpace::enter(&run).unwrap();
+        let mut line = None;
+        wait_until("the attach desk", || {
+            line = space.open_attach_line().ok();
+            line.is_some()
+        });
+        let line = line.unwrap();
+        let good = AttachRequest {
+            instance: 1,
+            schema_hash: schema_hash(),
+            process_id: std::process::id(),
+            role: Role::Coordinator as u16,
+            wanted_index: ANY_INDEX,
+            phase: ATTACH_JOIN,
+            ..AttachRequest::default()
+        };
+        let cases = [
+            // A coordinator that gives a controller's name.
+            (AttachRequest { controller: 123, ..good }, ATTACH_NO_CONTROLLER),
+            (AttachRequest { phase: 9, ..good }, ATTACH_BAD_PHASE),
+            // Ready without having joined.
+            (AttachRequest { phase: ATTACH_READY, ..good }, ATTACH_NO_ROOM),
+        ];
+        for (i, (request, status)) in (10..).zip(cases) {
+            let request = AttachRequest { instance: i, ..request };
+            line.request(request).unwrap();
+            wait_until("the reply", || {
+                assert!(common::is_alive(world.id()), "{request:?} has ended the world");
+                let reply = line.next_reply().unwrap();
+                reply.is_some_and(|frame| {
+                    assert_eq!((frame.reply().instance, frame.reply().status), (i, status));
+                    !frame.scenario().is_empty()
+                })
+            });
+        }
+    }
+    let mut parts = [env!("CARGO_BIN_EXE_cz-coord"), env!("CARGO_BIN_EXE_cz-ctrl")].map(start);
+    let output = world.wait_with_output().unwrap();
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success() && said.contains("4bd61fbe17f858e7"), "{said}");
+    assert!(parts.iter_mut().all(|part| part.wait().unwrap().success()));
 }

@@ -39,10 +39,11 @@ fn a_good_controller_passes() {
 }
 
 /// Mode, rule, step (a vehicle may come later than the fault sets in), and words of the diagnosis.
-const BROKEN: [(&str, &str, Option<u64>, &str); 21] = [
+const BROKEN: [(&str, &str, Option<u64>, &str); 22] = [
     ("nan", "finite", Some(120), "field u_mps2"),
     ("bad-intent", "finite", Some(120), "planned_exit_time_s"),
     ("out-of-range", "limits", Some(120), "is commanded 4.5 m/s^2, which is not within [-4, 4]"),
+    ("worlds-verdict", "verdict", Some(120), "has verdict 5, expected 0 to 3"),
     ("stale-step", "step", Some(120), "step 119, expected step 120"),
     ("wrong-run", "run", Some(120), "belongs to run"),
     ("wrong-schema", "schema", Some(120), "schema"),

@@ -342,11 +342,14 @@ fn a_wrong_byte_anywhere_is_noticed_and_spoils_one_step_at_most() {
         assert!(!flaws.is_empty(), "{what}: not noticed");
         let in_a_step = at < *run.offsets.last().unwrap();
         assert_eq!(steps, if in_a_step { count - 1 } else { count }, "{what}: {flaws:?}");
-        // One step asked for by itself is the right one, or none.
+        // A step asked for by itself is there exactly if it is among all, also the next ones.
         let reader = Reader::new(&bytes[..]).unwrap();
-        let number = random.random_range(0..count);
-        if let Ok(Some(step)) = reader.step(number) {
-            assert!(run.steps[number as usize] == step, "{what}: step {number}");
+        let hit = run.offsets.partition_point(|offset| *offset <= at).saturating_sub(1);
+        let number = (hit + random.random_range(0..3)).min(count as usize - 1);
+        let is_there = reader.steps().flatten().any(|step| step.header.step == number as u64);
+        match reader.step(number as u64) {
+            Ok(Some(step)) => assert!(is_there && run.steps[number] == step, "{what}: step {number}"),
+            missing => assert!(!is_there, "{what}: step {number}: {missing:?}"),
         }
     }
     assert!(refused > 0, "the head was never hit");
@@ -541,6 +544,32 @@ fn a_full_disk_is_an_error_at_the_end_and_stops_nobody() {
     }
     let error = recorder.finish(RunEnd::Finished).unwrap_err().to_string();
     assert!(error.contains("cannot write the recording"), "{error}");
+}
+
+#[test]
+fn a_recording_of_another_version_is_refused_by_all_who_read_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("old.czlog");
+    let name = file.to_str().unwrap();
+    for (found, version) in [(1_u32, "1"), (3, "3"), (u32::MAX, "4294967295")] {
+        let mut bytes = small().bytes;
+        bytes[8..12].copy_from_slice(&found.to_le_bytes());
+        std::fs::write(&file, &bytes).unwrap();
+        for arguments in [
+            &["show", name][..],
+            &["verify", name, name],
+            &["replay", name],
+            &["resume", name],
+            &["branch", name, "--at", "5", "--set", "objective.beta=1.0"],
+        ] {
+            let output = Site::new("old").command("cz").args(arguments).output().unwrap();
+            let said = String::from_utf8(output.stderr).unwrap();
+            let expected = format!(
+                "cz: {name}: the recording has format version {version}, this program reads version 2\n"
+            );
+            assert_eq!((output.status.code(), said), (Some(2), expected), "{arguments:?}");
+        }
+    }
 }
 
 #[test]

@@ -5,11 +5,12 @@
 mod common;
 
 use common::{Process, Site, children, is_alive, send, ticks, wait_until};
+use control_zones::record::{Reader, Writer};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::process::Signal;
 use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::process::{Output, Stdio};
 use std::time::Duration;
 
 /// Steady traffic through two zones, 100 000 steps.
@@ -117,6 +118,107 @@ fn a_run_whose_supervisor_is_killed_is_resumed_to_the_same_hash() {
 fn cut_short_twenty_times_each() {
     cut_short(20, "world", &[], 3);
     cut_short(20, "supervisor", &[], 3);
+}
+
+/// Starts `cz resume FILE --record OUT` and kills its world in the middle.
+fn resume_cut_short(site: &Site, file: &Path, out: &Path) {
+    let arguments = ["resume", file.to_str().unwrap(), "--record", out.to_str().unwrap()];
+    let mut supervisor =
+        site.command("cz").args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+    let past = steps_in(file);
+    wait_until("the resumed run to be ahead of its past", || {
+        assert!(supervisor.try_wait().unwrap().is_none(), "the resumed run was over before it was killed");
+        out.exists() && steps_in(out) > past + 1000
+    });
+    let parts = children(supervisor.id());
+    let world = parts.iter().find(|(_, line)| line.get(1).is_some_and(|part| part == "world")).unwrap().0;
+    send(world, Signal::KILL);
+    assert!(!supervisor.wait().unwrap().success());
+    wait_until("the others to end", || parts.iter().all(|(id, _)| !is_alive(*id)));
+}
+
+/// Steps of a recording that may still be written; none while its head is not there.
+fn steps_in(file: &Path) -> u64 {
+    Reader::open(file).map_or(0, |reader| reader.steps().map_while(Result::ok).count() as u64)
+}
+
+#[test]
+fn a_resumed_run_is_recorded_with_its_past_and_can_be_resumed_again() {
+    let (site, directory) = (Site::new("rr"), tempfile::tempdir().unwrap());
+    let path = |name: &str| directory.path().join(name);
+    let (undisturbed, first, second, last) = (path("u"), path("1"), path("2"), path("3"));
+    let of = |path: &Path| path.to_str().unwrap().to_owned();
+    let expected = common::hash(&site.summary(&[&LONG[..], &["--record", &of(&undisturbed)]].concat()));
+    let (supervisor, parts) = begin(&site, &LONG, &first, 3);
+    wait_until("the run to be under way", || steps_in(&first) > 1000);
+    send(part(&parts, "world"), Signal::KILL);
+    assert!(!supervisor.ended().status.success());
+    wait_until("the others to end", || parts.iter().all(|(_, id)| !is_alive(*id)));
+    resume_cut_short(&site, &first, &second);
+    let output = cz(&site, &["resume", &of(&second), "--record", &of(&last), "--json", "-"]);
+    assert!(output.status.success(), "{output:?}");
+    assert_eq!(common::hash(&serde_json::from_slice(&output.stdout).unwrap()), expected);
+    // The last recording is one of the whole run, and nothing in it tells that it was interrupted twice.
+    let output = cz(&site, &["verify", &of(&undisturbed), &of(&last)]);
+    assert!(output.status.success(), "{output:?}");
+    let output = cz(&site, &["replay", &of(&last)]);
+    assert!(output.status.success() && text(&output.stdout).contains(&expected), "{output:?}");
+    let output = cz(&site, &["show", &of(&last)]);
+    assert!(output.status.success(), "{output:?}");
+    let reader = Reader::open(&last).unwrap();
+    let run_id = reader.metadata().run_id;
+    assert!(reader.steps().all(|step| step.unwrap().header.run_id == run_id));
+    assert_ne!(run_id, Reader::open(&first).unwrap().metadata().run_id);
+    assert!(cz(&site, &["clean"]).status.success());
+    site.assert_clean();
+}
+
+#[test]
+fn a_resumed_run_is_not_recorded_over_its_own_past() {
+    let (site, directory) = (Site::new("own"), tempfile::tempdir().unwrap());
+    let file = file(&directory);
+    site.summary(&["--in-process", "--record", file.to_str().unwrap()]);
+    let whole = std::fs::read(&file).unwrap();
+    let cut = &whole[..whole.len() / 2];
+    std::fs::write(&file, cut).unwrap();
+    let alias = directory.path().join("alias.czlog");
+    std::os::unix::fs::symlink(&file, &alias).unwrap();
+    for out in [&file, &alias] {
+        let output = cz(&site, &["resume", file.to_str().unwrap(), "--record", out.to_str().unwrap()]);
+        assert_eq!(output.status.code(), Some(2), "{output:?}");
+        let said = text(&output.stderr);
+        assert!(said.contains("--record") && said.contains("another file"), "{said}");
+        assert_eq!(std::fs::read(&file).unwrap(), cut);
+    }
+}
+
+#[test]
+fn a_run_cut_off_behind_a_missed_step_goes_on_as_if_it_had_not_been() {
+    let (site, directory) = (Site::new("mc"), tempfile::tempdir().unwrap());
+    let (file, cut, out) =
+        (file(&directory), directory.path().join("cut.czlog"), directory.path().join("out.czlog"));
+    let (supervisor, parts) = begin(&site, &[&PACED[..], &["--on-miss", "hold"]].concat(), &file, 3);
+    std::thread::sleep(Duration::from_millis(2500));
+    send(part(&parts, "ctrl"), Signal::STOP);
+    std::thread::sleep(Duration::from_millis(500));
+    send(part(&parts, "ctrl"), Signal::CONT);
+    supervisor.ended().json();
+    let reader = Reader::open(&file).unwrap();
+    let mut writer = Writer::new(std::fs::File::create(&cut).unwrap(), reader.metadata()).unwrap();
+    let mut steps = reader.steps().map(Result::unwrap);
+    let missed = loop {
+        let step = steps.next().unwrap();
+        writer.append(&step.encode()).unwrap();
+        if step.misses != 0 {
+            break step.header.step;
+        }
+    };
+    drop(writer);
+    let output = cz(&site, &["resume", cut.to_str().unwrap(), "--record", out.to_str().unwrap()]);
+    assert!(output.status.success(), "{output:?}");
+    let output = cz(&site, &["replay", out.to_str().unwrap()]);
+    assert!(output.status.success(), "missed step {missed}: {output:?}");
+    site.assert_clean();
 }
 
 #[test]

@@ -108,6 +108,11 @@ fn the_base_is_valid() {
 /// Text of the base, its replacement, and the message.
 const FILE_CASES: &[(&str, &str, &str)] = &[
     (
+        "dt_s = 0.1",
+        "\"dt\\ns\" = 0.1",
+        "s.toml:3: dt\\ns = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
+    ),
+    (
         "[control]",
         "[[faults.sensors]]\nkind = \"frozen\"\nposition_m = 2\n[control]",
         "s.toml:12: faults.sensors.0.position_m = 2: unknown key; expected one of kind, zones, approaches, fraction, from_s, until_s",
@@ -136,42 +141,42 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "dt_s = \"fast\"",
-        "s.toml:3: dt_s = \"fast\": expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = \"fast\": expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt_s = 0.1",
         "dt_s = 0",
-        "s.toml:3: dt_s = 0: expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = 0: expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt_s = 0.1",
         "dt_s = -0.1",
-        "s.toml:3: dt_s = -0.1: expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = -0.1: expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt_s = 0.1",
         "dt_s = nan",
-        "s.toml:3: dt_s = nan: expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = nan: expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt_s = 0.1",
         "dt_s = inf",
-        "s.toml:3: dt_s = inf: expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = inf: expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt_s = 0.1",
         "dt_s = 1e999",
-        "s.toml:3: dt_s = 1e999: expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = 1e999: expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt_s = 0.1",
         "dt_s = 0.3333333333333333",
-        "s.toml:3: dt_s = 0.3333333333333333: expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = 0.3333333333333333: expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt_s = 0.1",
         "dt_s = 1979-05-27",
-        "s.toml:3: dt_s = 1979-05-27: expected a step > 0 s that is a whole number of nanoseconds",
+        "s.toml:3: dt_s = 1979-05-27: expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "name = \"base\"\n",
@@ -194,28 +199,32 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "vehicles = 10",
         "time_s = 0.01",
-        "s.toml:5: end.time_s = 0.01: expected a time from dt_s = 0.1 to 1e9 s",
+        "s.toml:5: end.time_s = 0.01: expected a time from dt_s = 0.1 to 1e8 s",
     ),
     (
         "v_max_mps = 30",
         "v_max_mps = 0",
-        "s.toml:7: vehicle.v_max_mps = 0: expected a speed > v_min_mps = 0 m/s",
+        "s.toml:7: vehicle.v_max_mps = 0: expected a speed from 0.1 to 1000 m/s, > v_min_mps = 0",
     ),
-    ("v_max_mps = 30", "v_min_mps = -1", "s.toml:7: vehicle.v_min_mps = -1: expected a speed >= 0 m/s"),
+    (
+        "v_max_mps = 30",
+        "v_min_mps = -1",
+        "s.toml:7: vehicle.v_min_mps = -1: expected a speed from 0 to 1000 m/s",
+    ),
     (
         "v_max_mps = 30",
         "v_min_mps = 30",
-        "s.toml:6: vehicle.v_max_mps: missing key; expected a speed > v_min_mps = 30 m/s (the default 30 is not)",
+        "s.toml:6: vehicle.v_max_mps: missing key; expected a speed from 0.1 to 1000 m/s, > v_min_mps = 30 (the default 30 is not)",
     ),
     (
         "v_max_mps = 30",
         "u_min_mps2 = 0",
-        "s.toml:7: vehicle.u_min_mps2 = 0: expected an acceleration < 0 m/s^2",
+        "s.toml:7: vehicle.u_min_mps2 = 0: expected an acceleration from -100 to -0.01 m/s^2",
     ),
     (
         "v_max_mps = 30",
         "u_max_mps2 = -4",
-        "s.toml:7: vehicle.u_max_mps2 = -4: expected an acceleration > 0 m/s^2",
+        "s.toml:7: vehicle.u_max_mps2 = -4: expected an acceleration from 0.01 to 100 m/s^2",
     ),
     (
         "v_max_mps = 30",
@@ -225,9 +234,9 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "beta = 0.5\n",
         "",
-        "s.toml:8: objective.beta: missing key; expected a weight > 0 m^2/s^4, or alpha instead",
+        "s.toml:8: objective.beta: missing key; expected a weight from 1e-6 to 1e6 m^2/s^4, or alpha instead",
     ),
-    ("beta = 0.5", "beta = 0", "s.toml:9: objective.beta = 0: expected a weight > 0 m^2/s^4"),
+    ("beta = 0.5", "beta = 0", "s.toml:9: objective.beta = 0: expected a weight from 1e-6 to 1e6 m^2/s^4"),
     (
         "beta = 0.5",
         "alpha = 0.5\nbeta = 0.5",
@@ -237,12 +246,12 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "k_merge_per_s = 1",
         "k_merge_per_s = 0",
-        "s.toml:11: control.k_merge_per_s = 0: expected a gain > 0 1/s",
+        "s.toml:11: control.k_merge_per_s = 0: expected a gain from 1e-6 to 1e6 1/s",
     ),
     (
         "k_merge_per_s = 1",
         "slack_weight = -1",
-        "s.toml:11: control.slack_weight = -1: expected a weight >= 0",
+        "s.toml:11: control.slack_weight = -1: expected 0, or a weight from 1e-6 to 1e6 m^2/s^4",
     ),
     (
         "k_merge_per_s = 1",
@@ -348,12 +357,12 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "baseline_mps = 18",
         "baseline_mps = \"best\"",
-        "s.toml:26: zones.first.flow.baseline_mps = \"best\": expected a speed with 0 < v <= v_max_mps = 30 m/s, or \"optimal\"",
+        "s.toml:26: zones.first.flow.baseline_mps = \"best\": expected a speed from 0.01 to 1000 m/s and <= v_max_mps = 30, or \"optimal\"",
     ),
     (
         "baseline_mps = 18",
         "baseline_mps = \"optimal\", baseline_entry_speeds_mps = [15, 0]",
-        "s.toml:26: zones.first.flow.baseline_entry_speeds_mps.1 = 0: expected a speed with 0 < v <= v_max_mps = 30 m/s",
+        "s.toml:26: zones.first.flow.baseline_entry_speeds_mps.1 = 0: expected a speed from 0.01 to 1000 m/s and <= v_max_mps = 30",
     ),
     (
         "baseline_mps = 18",
@@ -363,7 +372,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "gain_mps = 0.5",
         "gain_mps = -0.5",
-        "s.toml:26: zones.first.flow.gain_mps = -0.5: expected a gain >= 0 m/s per vehicle",
+        "s.toml:26: zones.first.flow.gain_mps = -0.5: expected a gain from 0 to 1000 m/s per vehicle",
     ),
     (
         "segment_m = 50",
@@ -378,7 +387,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "policy = \"fixed\", terminal_mps = 15",
         "policy = \"fixed\"",
-        "s.toml:33: zones.second.flow.terminal_mps: missing key; expected a speed with 0 < v <= v_max_mps = 30 m/s",
+        "s.toml:33: zones.second.flow.terminal_mps: missing key; expected a speed from 0.01 to 1000 m/s and <= v_max_mps = 30",
     ),
     (
         "policy = \"fixed\", terminal_mps = 15",
@@ -388,22 +397,22 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "terminal_mps = 15",
         "terminal_mps = 31",
-        "s.toml:33: zones.second.flow.terminal_mps = 31: expected a speed with 0 < v <= v_max_mps = 30 m/s",
+        "s.toml:33: zones.second.flow.terminal_mps = 31: expected a speed from 0.01 to 1000 m/s and <= v_max_mps = 30",
     ),
     (
         "length_m = 200",
         "length_m = -200",
-        "s.toml:29: zones.first.approaches.a.length_m = -200: expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+        "s.toml:29: zones.first.approaches.a.length_m = -200: expected a length from 1 to 1e6 m, >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
     ),
     (
         "length_m = 200",
         "length_m = 2.9",
-        "s.toml:29: zones.first.approaches.a.length_m = 2.9: expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+        "s.toml:29: zones.first.approaches.a.length_m = 2.9: expected a length from 1 to 1e6 m, >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
     ),
     (
         "length_m = 200",
         "length_m = \"200 m\"",
-        "s.toml:29: zones.first.approaches.a.length_m = \"200 m\": expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+        "s.toml:29: zones.first.approaches.a.length_m = \"200 m\": expected a length from 1 to 1e6 m, >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
     ),
     (
         "length_m = 200",
@@ -413,7 +422,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "link_m = 40",
         "link_m = 1",
-        "s.toml:38: zones.second.approaches.a.link_m = 1: expected 0 (no link), or a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+        "s.toml:38: zones.second.approaches.a.link_m = 1: expected 0, or a length from 1 to 1e6 m, >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
     ),
     (
         "road = \"north\"",
@@ -488,6 +497,20 @@ fn bad_files() {
 
 /// What follows `--set`, and the message.
 const SET_CASES: &[(&str, &str)] = &[
+    // Whatever characters there are, a message has one line.
+    (
+        "control.replan=from\nstate",
+        "--set control.replan=from\\nstate: control.replan = \"from\\nstate\": expected \"from_entry\" or \"from_state\"",
+    ),
+    (
+        "end.ti\nme_s=1",
+        "--set end.ti\\nme_s=1: end.ti\\nme_s = 1: unknown key; expected one of vehicles, time_s; did you mean time_s?",
+    ),
+    (
+        "zones.fi\r\nrst.flow=1",
+        "--set zones.fi\\r\\nrst.flow=1: zones has no element fi\\r\\nrst; expected first, second, or an index from 0 to 1; did you mean first?",
+    ),
+    ("a\u{1b}[2J", "--set a\\u{1b}[2J: no '='; expected key=value"),
     (
         "faults.nose={}",
         "--set faults.nose={}: faults.nose = {...}: unknown key; expected one of noise, sensors, commands, stalls; did you mean noise?",
@@ -572,10 +595,10 @@ const SET_CASES: &[(&str, &str)] = &[
         "objective={beta=1",
         "--set objective={beta=1: not valid TOML: unclosed inline table, expected `}`; expected a TOML value",
     ),
-    ("dt_s=0", "--set dt_s=0: dt_s = 0: expected a step > 0 s that is a whole number of nanoseconds"),
+    ("dt_s=0", "--set dt_s=0: dt_s = 0: expected a step from 1e-4 to 10 s, a whole number of nanoseconds"),
     (
         "dt_s=0.1s",
-        "--set dt_s=0.1s: dt_s = \"0.1s\": expected a step > 0 s that is a whole number of nanoseconds",
+        "--set dt_s=0.1s: dt_s = \"0.1s\": expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
         "dt=0.1",
@@ -603,11 +626,11 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "zones.first.flow.policy=fixed",
-        "--set zones.first.flow.policy=fixed: zones.first.flow.terminal_mps: missing key; expected a speed with 0 < v <= v_max_mps = 30 m/s",
+        "--set zones.first.flow.policy=fixed: zones.first.flow.terminal_mps: missing key; expected a speed from 0.01 to 1000 m/s and <= v_max_mps = 30",
     ),
     (
         "zones.first.flow={policy=\"fixed\",terminal_mps=-15}",
-        "--set zones.first.flow={policy=\"fixed\",terminal_mps=-15}: zones.first.flow.terminal_mps = -15: expected a speed with 0 < v <= v_max_mps = 30 m/s",
+        "--set zones.first.flow={policy=\"fixed\",terminal_mps=-15}: zones.first.flow.terminal_mps = -15: expected a speed from 0.01 to 1000 m/s and <= v_max_mps = 30",
     ),
     (
         "zones.second.flow={policy=\"mean_speed\",offset_mps=1,gain_mps=1,segment_m=50}",
@@ -615,7 +638,7 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "zones.second.approaches.b.length_m=1",
-        "--set zones.second.approaches.b.length_m=1: zones.second.approaches.b.length_m = 1: expected a length >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
+        "--set zones.second.approaches.b.length_m=1: zones.second.approaches.b.length_m = 1: expected a length from 1 to 1e6 m, >= 3 m = v_max_mps * dt_s, so that a vehicle passes at most one boundary per step",
     ),
     ("dt_s.x=1", "--set dt_s.x=1: dt_s = 0.1: has no keys; expected a table"),
     (
@@ -629,7 +652,7 @@ const SET_CASES: &[(&str, &str)] = &[
     ("zones=[]", "--set zones=[]: zones = []: expected a list of zones, at least one"),
     (
         "roads.west.demand.rates=[{until_s=1,vehicles_per_hour=1}]",
-        "--set roads.west.demand.rates=[{until_s=1,vehicles_per_hour=1}]: roads.west.demand.min_headway_s: missing key; expected a time >= 0 s",
+        "--set roads.west.demand.rates=[{until_s=1,vehicles_per_hour=1}]: roads.west.demand.min_headway_s: missing key; expected a time from 0 to 1e6 s",
     ),
     (
         "zones.first.approaches.a.zone=second",

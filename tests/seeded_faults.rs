@@ -8,7 +8,9 @@ use common::{Site, children, hash, send, ticks, wait_until};
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{Override, Scenario, load};
 use control_zones::world::{FaultCounts, World, WorldSummary};
-use ipc_schemas::{NO_ZONE, STATE_LEFT, VehicleCommand, VehicleState};
+use ipc_schemas::{
+    NO_ZONE, STATE_LEFT, VERDICT_BOUND, VERDICT_FALLBACK, VERDICT_HELD, VehicleCommand, VehicleState,
+};
 use rustix::process::Signal;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -77,6 +79,40 @@ const EVERYTHING: [&str; 4] = [
      {kind=\"frozen\",zones=[\"merge-1\"],from_s=60,until_s=65}]",
     "faults.stalls=[{approaches=[\"merge-2.main\"],from_s=80,until_s=82}]",
 ];
+
+#[test]
+fn a_controller_cannot_claim_the_worlds_own_verdicts() {
+    // What the world puts in after a missed deadline is neither lost nor silenced; who claims to be the world
+    // does not get away with it.
+    let scenario = scenario("two-merges", 1, &["faults.commands={loss=1.0}"]);
+    let mut world = World::new(scenario, 1);
+    while !world.records().any(|r| is_member(&r)) {
+        world.command(0, &[]).unwrap();
+        world.advance().unwrap();
+    }
+    let of = |world: &World, verdict| -> Vec<VehicleCommand> {
+        let commanded = |r: VehicleState| VehicleCommand {
+            u_mps2: 1.0,
+            vehicle: r.vehicle,
+            zone: r.zone,
+            verdict,
+            ..VehicleCommand::default()
+        };
+        world.records().filter(is_member).map(commanded).collect()
+    };
+    for verdict in [VERDICT_HELD, VERDICT_FALLBACK, 6, u16::MAX] {
+        let fault = world.command(0, &of(&world, verdict)).unwrap_err();
+        let words = format!("field verdict: vehicle 0 has verdict {verdict}, expected 0 to 3");
+        assert!(fault.to_string().contains(&words), "{fault}");
+    }
+    let first_mps2 = |world: &World| world.records().find(is_member).unwrap().u_mps2;
+    world.command(0, &of(&world, VERDICT_BOUND)).unwrap();
+    world.advance().unwrap();
+    assert_eq!((first_mps2(&world), counts(&world.summary()).commands_lost), (0.0, 1));
+    world.put_in(0, &of(&world, VERDICT_HELD)).unwrap();
+    world.advance().unwrap();
+    assert_eq!((first_mps2(&world), counts(&world.summary()).commands_lost), (1.0, 1));
+}
 
 #[test]
 fn the_number_of_processes_changes_nothing() {

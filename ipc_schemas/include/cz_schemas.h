@@ -125,6 +125,8 @@
 #define CZ_ATTACH_NO_CONTROLLER UINT32_C(5)
 /** `cz_attach_reply_t.status`: the run is under way and does without newcomers. */
 #define CZ_ATTACH_UNDER_WAY UINT32_C(6)
+/** `cz_attach_reply_t.status`: the request names a phase there is not. */
+#define CZ_ATTACH_BAD_PHASE UINT32_C(7)
 
 /** `cz_approach_spec_t.flags`: the controller that asked drives this approach. */
 #define CZ_APPROACH_OWN UINT32_C(1)
@@ -381,8 +383,8 @@ typedef struct cz_vehicle_command {
     uint32_t binding_rows;
     /** Memory: 0 entered, 1 FE, 2 OCBF. */
     uint16_t mode;
-    /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; put in by the world when a deadline was
-     *  missed: 4 held, 5 held within what the shield allows. */
+    /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a deadline was
+     *  missed, and refused from a controller: 4 held, 5 held within what the shield allows. */
     uint16_t verdict;
 } cz_vehicle_command_t;
 CZ_ASSERT_(vehicle_command_size, sizeof(cz_vehicle_command_t) == 96);

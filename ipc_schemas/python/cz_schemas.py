@@ -101,6 +101,8 @@ ATTACH_BAD_ROLE = 4
 ATTACH_NO_CONTROLLER = 5
 #: `AttachReply.status`: the run is under way and does without newcomers.
 ATTACH_UNDER_WAY = 6
+#: `AttachReply.status`: the request names a phase there is not.
+ATTACH_BAD_PHASE = 7
 
 #: `ApproachSpec.flags`: the controller that asked drives this approach.
 APPROACH_OWN = 1
@@ -335,8 +337,9 @@ class VehicleCommand(ctypes.Structure):
         binding_rows: Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4
             rear end, 5 rear-end feasibility, 6 merge, 7 merge feasibility.
         mode: Memory: 0 entered, 1 FE, 2 OCBF.
-        verdict: 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; put in by the world when a deadline
-            was missed: 4 held, 5 held within what the shield allows.
+        verdict: 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a
+            deadline was missed, and refused from a controller: 4 held, 5 held within what the
+            shield allows.
     """
 
     _fields_ = [

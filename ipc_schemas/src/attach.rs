@@ -41,6 +41,8 @@ codes! {
     pub const ATTACH_NO_CONTROLLER: u32 = 5;
     /// [`AttachReply::status`]: the run is under way and does without newcomers.
     pub const ATTACH_UNDER_WAY: u32 = 6;
+    /// [`AttachReply::status`]: the request names a phase there is not.
+    pub const ATTACH_BAD_PHASE: u32 = 7;
 }
 
 record! {

@@ -65,8 +65,8 @@ record! {
         pub binding_rows: u32,
         /// Memory: 0 entered, 1 FE, 2 OCBF.
         pub mode: u16,
-        /// 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; put in by the world when a deadline was missed:
-        /// 4 held, 5 held within what the shield allows.
+        /// 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a deadline was
+        /// missed, and refused from a controller: 4 held, 5 held within what the shield allows.
         pub verdict: u16,
     }
 }

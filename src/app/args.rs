@@ -504,6 +504,10 @@ pub(super) struct ResumeArgs {
     /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,
+    /// Record the run in this file, its past included: a recording of the whole run. Not the file it goes on
+    /// from; an older recording is replaced.
+    #[arg(long, value_name = "FILE")]
+    pub record: Option<PathBuf>,
     /// Name of the run; runs of different names do not see each other [default: one of its own].
     #[arg(long, value_name = "NAME")]
     pub run: Option<RunName>,

@@ -5,6 +5,7 @@ mod bench;
 mod clean;
 mod controllers;
 mod golden;
+mod lines;
 mod parts;
 mod plan;
 mod plugin;
@@ -22,6 +23,7 @@ pub use show::everything as show_everything;
 use crate::process::ProcessError;
 use crate::reproduce::{self, ReproduceError};
 use crate::scenario::ScenarioError;
+use crate::scenario::load::printable;
 use clap::Parser;
 use std::process::ExitCode;
 
@@ -120,8 +122,20 @@ fn finish(program: &str, result: Result<(), AppError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("{program}: {error}");
+            eprintln!("{program}: {}", error.words());
             ExitCode::from(error.exit_code())
+        }
+    }
+}
+
+impl AppError {
+    /// The message, in one line whatever characters the input has; but the failure of a run has a line for
+    /// each process that has something to say of it.
+    fn words(&self) -> String {
+        let text = self.to_string();
+        match self {
+            AppError::Failed(_) => text.split("\n  ").map(printable).collect::<Vec<_>>().join("\n  "),
+            _ => printable(&text),
         }
     }
 }

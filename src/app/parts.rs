@@ -1,13 +1,14 @@
 //! `cz world`, `cz coord`, `cz ctrl`: one process of a run.
 
 use super::args::{PartArgs, Restart, WaitArgs, WorldArgs};
+use super::lines::{RefusedLine, SettledLine, WorldLine};
 use super::record::Recording;
 use super::report::{Summary, Transport};
-use super::supervise::{SettledLine, WorldLine};
 use super::{AppError, record};
+use crate::lockstep::RefusedFrames;
 use crate::process::{
-    Joining, Observation, Settled, Settling, StopFlag, WorldOptions, new_run_id, run_controller,
-    run_coordinator, run_world,
+    Joining, Observation, Settled, Settling, StopFlag, WorldOptions, first_missing_step, new_run_id,
+    run_controller, run_coordinator, run_world,
 };
 use crate::scenario::scenario_hash;
 use crate::world::World;
@@ -31,7 +32,12 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     let run_id = args.run_id.unwrap_or_else(new_run_id);
     let observation = match &args.record {
         Some(path) => {
-            let recording = Recording::start(path, &args.scenario, &scenario, share, run_id)?;
+            let recording = match (&resume, &args.resume) {
+                (Some(reader), Some(from)) => {
+                    Recording::continuation(path, reader, from, first_missing_step(reader), run_id)?
+                }
+                _ => Recording::start(path, &args.scenario, &scenario, share, run_id)?,
+            };
             let push = |r: &mut Recording, step, block: &[u8]| r.push_block(step, block);
             Some(Observation::start(args.run.clone(), recording, push))
         }
@@ -78,14 +84,14 @@ pub(super) fn coordinator(args: &PartArgs) -> Result<(), AppError> {
     let (joining, stop) = prepare(args, Role::Coordinator)?;
     let report = report_to(args.supervised, &args.wait);
     let settling = settling(&args.wait, &*report);
-    Ok(run_coordinator(&args.run, joining, args.wait.peer_timeout, &settling, &stop)?)
+    Ok(run_coordinator(&args.run, joining, args.wait.peer_timeout, &settling, &refused_to(args), &stop)?)
 }
 
 pub(super) fn controller(args: &PartArgs) -> Result<(), AppError> {
     let (joining, stop) = prepare(args, Role::Controller)?;
     let report = report_to(args.supervised, &args.wait);
     let settling = settling(&args.wait, &*report);
-    Ok(run_controller(&args.run, joining, args.wait.peer_timeout, &settling, &stop)?)
+    Ok(run_controller(&args.run, joining, args.wait.peer_timeout, &settling, &refused_to(args), &stop)?)
 }
 
 fn settling<'a>(wait: &WaitArgs, report: &'a dyn Fn(&Settled)) -> Settling<'a> {
@@ -99,6 +105,15 @@ fn report_to(supervisor: Option<u32>, wait: &WaitArgs) -> Box<dyn Fn(&Settled)> 
         (Some(_), _) => Box::new(|settled| eprintln!("{}", SettledLine(settled.clone()).to_line())),
         (None, true) => Box::new(|settled| eprintln!("{settled}")),
         (None, false) => Box::new(|_| {}),
+    }
+}
+
+/// Where it is said whose frames were refused: to the supervisor, or to people.
+fn refused_to(args: &PartArgs) -> impl Fn(RefusedFrames) + use<> {
+    let is_supervised = args.supervised.is_some();
+    move |refused| match is_supervised {
+        true => eprintln!("{}", RefusedLine(refused).to_line()),
+        false => eprintln!("{refused}"),
     }
 }
 

@@ -4,12 +4,13 @@ use super::args::{ReplayArgs, ScenarioArgs, ShareArgs, VerifyArgs};
 use super::show::number;
 use super::{AppError, print};
 use crate::record::{
-    FileSource, Flaw, Metadata, Processes, Reader, RecordError, Recorder, Replay, RunEnd, ScenarioSource,
-    StepFrames, Stop, compare, replay as replay_roles,
+    Build, FileSource, Flaw, Metadata, Processes, Reader, RecordError, Recorder, Replay, RunEnd,
+    ScenarioSource, StepFrames, Stop, compare, replay as replay_roles,
 };
 use crate::scenario::{Scenario, text_of};
 use indicatif::{ProgressBar, ProgressDrawTarget};
 use serde_json::json;
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 impl From<RecordError> for AppError {
@@ -50,6 +51,31 @@ impl Recording {
         Ok(Recording { recorder: Recorder::create(path, &metadata)?, path: path.to_owned() })
     }
 
+    /// Starts the recording of a run that goes on from another recording: its first `steps` steps are the past
+    /// of this one, under the run's new id. The world compares them all before the run goes on.
+    pub fn continuation(
+        path: &Path,
+        reader: &Reader<FileSource>,
+        from: &Path,
+        steps: u64,
+        run_id: u64,
+    ) -> Result<Recording, AppError> {
+        if is_same_file(path, from) {
+            let problem = "the run goes on from this recording; expected another file";
+            return Err(AppError::Usage(format!("--record {}: {problem}", path.display())));
+        }
+        let metadata = Metadata { run_id, build: Build::own(), ..reader.metadata().clone() };
+        let mut recorder = Recorder::create(path, &metadata)?;
+        for step in reader.steps().take(steps as usize) {
+            let mut step = step.map_err(|damage| AppError::Usage(format!("{}: {damage}", from.display())))?;
+            step.header.run_id = run_id;
+            if !recorder.push_step_or_wait(&step) {
+                break; // it has failed, and says so at the end
+            }
+        }
+        Ok(Recording { recorder, path: path.to_owned() })
+    }
+
     /// Records a step of a run in this process, which may wait for the disk. A failure is told of at the end.
     pub fn push(&mut self, frames: &StepFrames<'_>) {
         self.recorder.push_or_wait(frames);
@@ -79,6 +105,12 @@ impl Recording {
         }
         Ok(())
     }
+}
+
+/// Whether both paths lead to the same file.
+fn is_same_file(a: &Path, b: &Path) -> bool {
+    let identity = |path: &Path| std::fs::metadata(path).ok().map(|file| (file.dev(), file.ino()));
+    identity(a).is_some_and(|a| Some(a) == identity(b))
 }
 
 /// A recording, or why it cannot be read.

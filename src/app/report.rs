@@ -191,7 +191,7 @@ impl Summary {
             ));
         }
         for r in &self.refused {
-            text.push_str(&format!("refused {} frames of {}; the last: {}\n", r.frames, r.sender, r.last));
+            text.push_str(&format!("{r}\n"));
         }
         for settled in self.placement.iter().filter(|_| self.show_placement) {
             text.push_str(&format!("{settled}\n"));

@@ -1,6 +1,7 @@
 //! `cz resume`: an interrupted run goes on. `cz branch`: another future of the same past.
 
 use super::args::{BranchArgs, ResumeArgs, ScenarioArgs};
+use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::run::{Bar, own_name};
 use super::supervise::{Plan, supervise};
@@ -50,11 +51,17 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         resume: Some(&args.file),
     };
     args.timing.timing()?;
+    let recording = match &args.record {
+        Some(path) => Some(Recording::continuation(path, &reader, &args.file, first, plan.run_id)?),
+        None => None,
+    };
     let bar = Bar::new(&scenario);
-    let (outcome, _) = supervise(&plan, None, |position| bar.show(position));
+    let (outcome, recording) = supervise(&plan, recording, |position| bar.show(position));
     bar.finish();
+    let recorded = recording.map_or(Ok(()), |recording| recording.finish(&outcome));
     let processes = 1 + share.coord_procs + scenario.controllers(share.ctrl_procs);
-    Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome?).deliver(args.json.as_deref())
+    Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome?).deliver(args.json.as_deref())?;
+    recorded
 }
 
 pub(super) fn branch(args: &BranchArgs) -> Result<(), AppError> {

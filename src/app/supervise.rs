@@ -2,52 +2,21 @@
 
 use super::AppError;
 use super::args::{Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs};
+use super::lines::{RefusedLine, SettledLine, WorldLine};
 use super::record::Recording;
 use super::run::Position;
+use crate::lockstep::RefusedFrames;
 use crate::process::{Observation, Outcome, ProcessError, Settled, WaitMode};
 use crate::scenario::Plugin;
 use crate::transport::iox::{RunName, RunSpace};
-use crate::world::World;
 use clap::ValueEnum;
 use crossbeam::channel::{Receiver, Sender, select, unbounded};
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
-use serde::{Deserialize, Serialize};
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::time::{Duration, Instant};
-
-/// What a supervised world says on its stdout, one JSON object a line.
-#[derive(Debug, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum WorldLine {
-    Progress(Position),
-    Outcome(Box<Outcome>),
-}
-
-impl WorldLine {
-    pub fn progress(world: &World) -> WorldLine {
-        WorldLine::Progress(Position::of(world))
-    }
-}
-
-/// What each process says on stderr before its run begins: where it is and what it was granted.
-#[derive(Debug)]
-pub(super) struct SettledLine(pub Settled);
-
-impl SettledLine {
-    /// Sets the line apart from everything else that is said on stderr.
-    const MARK: &str = "cz-settled ";
-
-    pub fn to_line(&self) -> String {
-        format!("{}{}", Self::MARK, serde_json::to_string(&self.0).expect("it has string keys only"))
-    }
-
-    fn of(line: &str) -> Option<SettledLine> {
-        serde_json::from_str(line.strip_prefix(Self::MARK)?).ok().map(SettledLine)
-    }
-}
 
 /// What to start.
 #[derive(Clone, Debug)]
@@ -119,11 +88,19 @@ fn oversee(plan: &Plan<'_>, observed: bool, progress: impl FnMut(Position)) -> R
     });
 
     let (events, inbox) = unbounded();
-    let mut family =
-        Family { children: Vec::new(), plugins: Vec::new(), events, restart: plan.restart, due: Vec::new() };
+    let mut family = Family {
+        children: Vec::new(),
+        plugins: Vec::new(),
+        events,
+        restart: plan.restart,
+        due: Vec::new(),
+        refused: Vec::new(),
+    };
     let result = family.start(plan, observed).and_then(|()| family.watch(&inbox, &signals, progress));
     if result.is_err() {
         family.end(&inbox);
+        // There is no summary to say it.
+        family.refused.iter().for_each(|refused| eprintln!("cz: {refused}"));
     }
     result
 }
@@ -163,6 +140,8 @@ struct Family {
     restart: Restart,
     /// Who is to be started again, and when.
     due: Vec<(Instant, Part)>,
+    /// What those that have ended had refused.
+    refused: Vec<RefusedFrames>,
 }
 
 /// How to start a process of ours.
@@ -344,6 +323,21 @@ impl Family {
         });
     }
 
+    /// Takes a line of a child's stderr.
+    fn said(&mut self, child: usize, line: String) {
+        let member = &mut self.children[child];
+        if self.plugins.contains(&child) {
+            eprintln!("[{}] {line}", member.name);
+        } else if let Some(SettledLine(settled)) = SettledLine::of(&line) {
+            member.settled = Some(settled);
+            return;
+        } else if let Some(RefusedLine(refused)) = RefusedLine::of(&line) {
+            self.refused.push(refused);
+            return;
+        }
+        member.last_words = Some(line);
+    }
+
     fn watch(
         &mut self,
         inbox: &Receiver<Event>,
@@ -366,16 +360,7 @@ impl Family {
                 recv(inbox) -> event => match event.expect("the family holds a sender") {
                     Event::Line { line: WorldLine::Progress(position) } => progress(position),
                     Event::Line { line: WorldLine::Outcome(result) } => outcome = Some(*result),
-                    Event::Said { child, line } => {
-                        if let Some(SettledLine(settled)) = SettledLine::of(&line) {
-                            self.children[child].settled = Some(settled);
-                            continue;
-                        }
-                        if self.plugins.contains(&child) {
-                            eprintln!("[{}] {line}", self.children[child].name);
-                        }
-                        self.children[child].last_words = Some(line);
-                    }
+                    Event::Said { child, line } => self.said(child, line),
                     Event::Ended { child, status } => {
                         self.children[child].running = false;
                         if let Some(how) = describe_failure(&status) {
@@ -402,10 +387,11 @@ impl Family {
         }
         match (failure, outcome) {
             (Some((error, _)), _) => Err(error),
-            (None, Some(outcome)) => Ok(Outcome {
-                placement: self.children.iter_mut().filter_map(|c| c.settled.take()).collect(),
-                ..outcome
-            }),
+            (None, Some(mut outcome)) => {
+                outcome.placement = self.children.iter_mut().filter_map(|c| c.settled.take()).collect();
+                outcome.refused.append(&mut self.refused);
+                Ok(outcome)
+            }
             (None, None) => Err(AppError::Failed("the world ended without results".to_owned())),
         }
     }
@@ -426,7 +412,8 @@ impl Family {
             while self.children.iter().any(|c| c.running) {
                 match inbox.recv_deadline(deadline) {
                     Ok(Event::Ended { child, .. }) => self.children[child].running = false,
-                    Ok(_) => {}
+                    Ok(Event::Said { child, line }) => self.said(child, line),
+                    Ok(Event::Line { .. }) => {}
                     Err(_) => break,
                 }
             }

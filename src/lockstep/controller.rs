@@ -76,7 +76,7 @@ where
 
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
-        self.refusals.report()
+        self.refusals.report(&self.identity)
     }
 
     /// Does what can be done now.

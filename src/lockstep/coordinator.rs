@@ -97,7 +97,7 @@ where
 
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
-        self.refusals.report()
+        self.refusals.report(&self.identity)
     }
 
     /// Does what can be done now.
@@ -298,6 +298,8 @@ mod tests {
         send(&mut fourth, header(Role::Coordinator, 4, 4), &[]);
         assert!(!act(&mut driver, 3), "it waits for the right one");
         assert_eq!(driver.refused().len(), 1);
-        assert!(driver.refused()[0].last.contains("step"), "{:?}", driver.refused());
+        let told = driver.refused()[0].to_string();
+        let expected = "coordinator 3 refused 1 frames of coordinator 4; the last: ";
+        assert!(told.starts_with(expected) && told.contains("step"), "{told}");
     }
 }

@@ -1,5 +1,6 @@
 //! Frames that are not taken: counted and attributed, and no reason to end anything.
 
+use super::Identity;
 use crate::control::pool::PoolError;
 use crate::world::CommandFault;
 use ipc_schemas::{FrameHeader, HeaderFault, Role};
@@ -80,12 +81,21 @@ impl std::fmt::Display for Claim {
 /// What was refused of one sender.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct RefusedFrames {
+    /// Who refused them.
+    pub receiver: String,
     /// Who sent them: the role and index claimed, and the process where it is known.
     pub sender: String,
     /// Their number.
     pub frames: u64,
     /// What was wrong with the last one.
     pub last: String,
+}
+
+impl std::fmt::Display for RefusedFrames {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let RefusedFrames { receiver, sender, frames, last } = self;
+        write!(f, "{receiver} refused {frames} frames of {sender}; the last: {last}")
+    }
 }
 
 /// Accounts are kept for this many senders; the rest share one.
@@ -136,15 +146,21 @@ impl Refusals {
         account.process_id
     }
 
-    /// All of it.
-    pub fn report(&self) -> Vec<RefusedFrames> {
+    /// All of it, as refused by this receiver.
+    pub fn report(&self, receiver: &Identity) -> Vec<RefusedFrames> {
+        let receiver = Claim { role: receiver.role as u16, index: receiver.index }.to_string();
         let sender = |a: &Account| match a.process_id {
             Some(id) => format!("{} (process {id})", a.claim),
             None => a.claim.to_string(),
         };
         self.accounts
             .iter()
-            .map(|a| RefusedFrames { sender: sender(a), frames: a.frames, last: a.last.to_string() })
+            .map(|a| RefusedFrames {
+                receiver: receiver.clone(),
+                sender: sender(a),
+                frames: a.frames,
+                last: a.last.to_string(),
+            })
             .collect()
     }
 }

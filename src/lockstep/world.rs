@@ -137,6 +137,12 @@ where
         self.ledger = ledger;
     }
 
+    /// Goes on from a recording in whose last step commands were put in: the next state says so, as it would
+    /// have without the interruption.
+    pub fn go_on_after_miss(&mut self) {
+        self.put_in = mask_of(self.controllers.len() as u32);
+    }
+
     /// The world as it stands.
     pub fn world(&self) -> &World {
         &self.world
@@ -177,7 +183,7 @@ where
         }
         for index in (0..self.controllers.len()).filter(|i| missing.commands >> i & 1 == 1) {
             let commands = self.world.substitute(index as u32, ledger.commands_before(index), verdict);
-            self.world.command(index as u32, &commands).expect(
+            self.world.put_in(index as u32, &commands).expect(
                 "what the world puts in has each of the controller's vehicles once, within its limits",
             );
             ledger.substitute(index, commands);
@@ -190,7 +196,7 @@ where
 
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
-        self.refusals.report()
+        self.refusals.report(&self.identity)
     }
 
     /// The number of answers that came too late or twice.

@@ -2,6 +2,7 @@
 
 use super::peers::is_alive;
 use super::run_spec::plugin_bytes;
+use super::seating::{Judgement, Seating};
 use super::{Peer, Peers, ProcessError, StopFlag, WaitMode};
 use crate::encoding;
 use crate::lockstep::{Handover, Seat};
@@ -181,7 +182,11 @@ fn refusal(request: &AttachRequest, reply: &AttachReply, plugins: &str) -> Strin
             format!("all places are taken; the run has {c} coordinator and {k} controller processes")
         }
         frames::ATTACH_BAD_ROLE => format!("it asked for role {}, which nobody has", request.role),
+        frames::ATTACH_BAD_PHASE => format!("it asked in phase {}, which there is not", request.phase),
         frames::ATTACH_UNDER_WAY => "the run is under way and nobody is missing in it".to_owned(),
+        frames::ATTACH_NO_CONTROLLER if request.role != Role::Controller as u16 => {
+            "it gave a controller's name and asked for another role".to_owned()
+        }
         frames::ATTACH_NO_CONTROLLER if plugins.is_empty() => {
             "the scenario declares no controllers; add a [[controllers]] table".to_owned()
         }
@@ -192,7 +197,7 @@ fn refusal(request: &AttachRequest, reply: &AttachReply, plugins: &str) -> Strin
     }
 }
 
-/// The world's side: a seat for each participant.
+/// The world's side: a desk at which participants ask for their places.
 #[derive(Debug)]
 pub(super) struct Reception {
     desk: AttachDesk,
@@ -200,46 +205,16 @@ pub(super) struct Reception {
     scenario: Vec<u8>,
     scenario_hash: u64,
     waiting: u32,
-    coordinators: Vec<Place>,
-    controllers: Vec<Place>,
-    /// Number of seats of the built-in pool, which come first.
-    pool: usize,
-    /// Name hash, and the bytes behind the reply, of each plug-in.
-    plugins: Vec<(u64, Vec<u8>)>,
+    seating: Seating,
+    /// The bytes behind the reply to each plug-in.
+    plugins: Vec<Vec<u8>>,
     plugin_names: String,
     /// The step a participant begins with.
     pub(super) first_step: u64,
-    /// Whether the run has begun.
-    pub(super) under_way: bool,
     /// Requests that cannot be answered yet.
     pending: Vec<AttachRequest>,
     /// Why somebody was refused last.
     pub(super) last_refusal: Option<String>,
-}
-
-/// A place among the processes of a role.
-#[derive(Clone, Copy, Debug, Default)]
-struct Place {
-    occupant: Option<Occupant>,
-    /// How often it has been taken anew since the run began.
-    generation: u32,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct Occupant {
-    instance: u64,
-    process_id: u32,
-    ready: bool,
-}
-
-impl Place {
-    fn is_free(&self) -> bool {
-        self.occupant.is_none_or(|o| !is_alive(o.process_id))
-    }
-
-    fn is_of(&self, instance: u64) -> bool {
-        self.occupant.is_some_and(|o| o.instance == instance)
-    }
 }
 
 /// What the world does about a request, as [`Reception::serve`] is told by its caller.
@@ -264,24 +239,23 @@ impl Reception {
         let drivers = Drivers::new(scenario, controllers);
         let plugins: Vec<_> = (drivers.pool()..)
             .zip(&scenario.plugins)
-            .map(|(index, plugin)| (plugin.name_hash(), plugin_bytes(scenario, &drivers, index)))
+            .map(|(index, _)| plugin_bytes(scenario, &drivers, index))
             .collect();
-        let longest = plugins.iter().map(|(_, b)| b.len()).max().unwrap_or(0).max(bytes.len());
+        let names = scenario.plugins.iter().map(|plugin| plugin.name_hash()).collect();
+        let longest = plugins.iter().map(Vec::len).max().unwrap_or(0).max(bytes.len());
+        let hash = scenario_hash(scenario);
         Ok(Reception {
             desk: space.create_attach_desk((coordinators + controllers) as usize, longest)?,
-            pool: drivers.pool() as usize,
+            seating: Seating::new(hash, coordinators as usize, controllers as usize, names),
             plugins,
             first_step: 0,
-            under_way: false,
             pending: Vec::new(),
             last_refusal: None,
             plugin_names: scenario.plugins.iter().map(|p| p.name.as_str()).collect::<Vec<_>>().join(", "),
             run_id,
-            scenario_hash: scenario_hash(scenario),
+            scenario_hash: hash,
             scenario: bytes,
             waiting: wait.code(),
-            coordinators: vec![Place::default(); coordinators as usize],
-            controllers: vec![Place::default(); controllers as usize],
         })
     }
 
@@ -306,7 +280,11 @@ impl Reception {
         request: AttachRequest,
         hand_over: &mut dyn FnMut(Role, u32, Seat) -> Readiness,
     ) -> Result<(), TransportError> {
-        let (status, index, generation) = self.judge(&request);
+        let judgement = self.seating.judge(&request, is_alive);
+        let (status, index, generation) = match judgement {
+            Judgement::Seated { index, generation, .. } => (frames::ATTACH_ACCEPTED, index, generation),
+            Judgement::Refused(status) => (status, 0, 0),
+        };
         let reply = AttachReply {
             instance: request.instance,
             run_id: self.run_id,
@@ -317,25 +295,25 @@ impl Reception {
             world_process_id: std::process::id(),
             generation,
             index,
-            coordinators: self.coordinators.len() as u32,
-            controllers: self.controllers.len() as u32,
+            coordinators: self.seating.places(Role::Coordinator).len() as u32,
+            controllers: self.seating.places(Role::Controller).len() as u32,
             waiting: self.waiting,
             reserved: 0,
         };
-        if status != frames::ATTACH_ACCEPTED {
+        let Judgement::Seated { role, plugin, .. } = judgement else {
             let reason = refusal(&request, &reply, &self.plugin_names);
             self.desk.reply(reply, reason.as_bytes())?;
             self.last_refusal = Some(reason);
             return Ok(());
-        }
-        let role = Role::from_code(request.role).filter(|_| request.phase != frames::ATTACH_JOIN);
+        };
+        let joins = request.phase == frames::ATTACH_JOIN;
         let seat = Seat::new(generation, request.process_id);
-        let handed = role.map_or(Readiness::Begin, |role| hand_over(role, index, seat));
-        if request.controller != frames::BUILT_IN {
-            return self.desk.reply(reply, &self.plugins[index as usize - self.pool].1);
+        let handed = if joins { Readiness::Begin } else { hand_over(role, index, seat) };
+        if let Some(plugin) = plugin {
+            return self.desk.reply(reply, &self.plugins[plugin]);
         }
         match handed {
-            _ if request.phase == frames::ATTACH_JOIN => self.desk.reply(reply, &self.scenario),
+            _ if joins => self.desk.reply(reply, &self.scenario),
             Readiness::Begin => self.desk.reply(reply, &[]),
             Readiness::Later => {
                 self.pending.push(request);
@@ -349,68 +327,20 @@ impl Reception {
         }
     }
 
-    /// Status, index and generation for a request.
-    fn judge(&mut self, request: &AttachRequest) -> (u32, u32, u32) {
-        if request.schema_hash != schema_hash() {
-            return (frames::ATTACH_OTHER_SCHEMA, 0, 0);
-        }
-        if request.scenario_hash != frames::ANY_SCENARIO && request.scenario_hash != self.scenario_hash {
-            return (frames::ATTACH_OTHER_SCENARIO, 0, 0);
-        }
-        let mut first = 0;
-        let places = match Role::from_code(request.role) {
-            Some(Role::Coordinator) => &mut self.coordinators[..],
-            Some(Role::Controller) if request.controller == frames::BUILT_IN => {
-                &mut self.controllers[..self.pool]
-            }
-            Some(Role::Controller) => {
-                let Some(plugin) = self.plugins.iter().position(|(hash, _)| *hash == request.controller)
-                else {
-                    return (frames::ATTACH_NO_CONTROLLER, 0, 0);
-                };
-                first = self.pool + plugin;
-                &mut self.controllers[first..=first]
-            }
-            _ => return (frames::ATTACH_BAD_ROLE, 0, 0),
-        };
-        let own = places.iter().position(|p| p.is_of(request.instance));
-        let is_newcomer = own.is_none() && request.phase == frames::ATTACH_JOIN;
-        let place = own.or_else(|| match request.wanted_index {
-            _ if !is_newcomer => None,
-            frames::ANY_INDEX => places.iter().position(Place::is_free),
-            wanted => {
-                let wanted = usize::from(wanted).wrapping_sub(first);
-                places.get(wanted).is_some_and(Place::is_free).then_some(wanted)
-            }
-        });
-        let Some(at) = place else {
-            let status = if self.under_way { frames::ATTACH_UNDER_WAY } else { frames::ATTACH_NO_ROOM };
-            return (status, 0, 0);
-        };
-        let place = &mut places[at];
-        if is_newcomer {
-            let AttachRequest { instance, process_id, .. } = *request;
-            place.occupant = Some(Occupant { instance, process_id, ready: false });
-            place.generation += u32::from(self.under_way);
-        }
-        if let Some(occupant) = place.occupant.as_mut().filter(|_| request.phase != frames::ATTACH_JOIN) {
-            occupant.ready = true;
-        }
-        (frames::ATTACH_ACCEPTED, (first + at) as u32, place.generation)
+    /// The run has begun: whoever comes from now on goes on from this step.
+    pub(super) fn go_on_from(&mut self, step: u64) {
+        self.seating.begin();
+        self.first_step = step;
     }
 
     /// The first participant that is not ready, or died since: its role and index.
     pub(super) fn first_missing(&self) -> Option<(Role, usize)> {
-        let there = |place: &Place| place.occupant.is_some_and(|o| o.ready && is_alive(o.process_id));
-        let missing = |places: &[Place]| places.iter().position(|p| !there(p));
-        missing(&self.coordinators)
-            .map(|i| (Role::Coordinator, i))
-            .or_else(|| missing(&self.controllers).map(|i| (Role::Controller, i)))
+        self.seating.first_missing(is_alive)
     }
 
     /// What to call a participant.
     pub(super) fn name_of(&self, role: Role, index: usize) -> String {
-        let plugin = (role == Role::Controller).then(|| index.checked_sub(self.pool)).flatten();
+        let plugin = (role == Role::Controller).then(|| index.checked_sub(self.seating.pool())).flatten();
         match plugin.and_then(|i| self.plugin_names.split(", ").nth(i)) {
             Some(name) => format!("controller {name} (attaching as CZ_CONTROLLER={name})"),
             None => format!("{role} {index}"),
@@ -419,37 +349,34 @@ impl Reception {
 
     /// Whether a controller is ready.
     pub(super) fn is_ready(&self, controller: usize) -> bool {
-        self.controllers[controller].occupant.is_some_and(|o| o.ready)
+        self.seating.places(Role::Controller)[controller].occupant.is_some_and(|o| o.ready)
     }
 
     /// Frees the place of a controller that has been ended.
     pub(super) fn vacate(&mut self, controller: usize) {
-        self.controllers[controller].occupant = None;
+        self.seating.vacate(controller);
     }
 
     /// Whether a controller is a plug-in.
     pub(super) fn is_plugin(&self, controller: usize) -> bool {
-        controller >= self.pool
+        controller >= self.seating.pool()
     }
 
     /// The generation of a controller.
     pub(super) fn generation(&self, controller: usize) -> u32 {
-        self.controllers[controller].generation
+        self.seating.places(Role::Controller)[controller].generation
     }
 
     /// All participants.
     pub(super) fn peers(&self) -> Peers {
-        let peers = |role, places: &[Place]| {
-            let processes: Vec<_> = places.iter().map(|p| p.occupant.map(|o| o.process_id)).collect();
-            (0..)
-                .zip(processes)
-                .filter_map(move |(index, process_id)| Some(Peer { role, index, process_id: process_id? }))
+        let of_role = |role| {
+            let places = self.seating.places(role).iter().zip(0..);
+            places.filter_map(move |(place, index)| {
+                let process_id = place.occupant?.process_id;
+                Some(Peer { role, index, process_id })
+            })
         };
-        Peers(
-            peers(Role::Coordinator, &self.coordinators)
-                .chain(peers(Role::Controller, &self.controllers))
-                .collect(),
-        )
+        Peers(of_role(Role::Coordinator).chain(of_role(Role::Controller)).collect())
     }
 }
 

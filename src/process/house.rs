@@ -108,7 +108,7 @@ impl House {
     /// Sees to whoever has come.
     pub(super) fn attend(&mut self, driver: &mut Driver, waiter: &mut Waiter) -> Result<(), ProcessError> {
         let House { reception, arrived, gone, .. } = self;
-        (reception.under_way, reception.first_step) = (true, driver.world().step());
+        reception.go_on_from(driver.world().step());
         let before = arrived.len();
         reception.serve(&mut |role, index, seat| {
             driver.seat(role, index, seat);

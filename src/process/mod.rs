@@ -11,6 +11,7 @@ mod placement;
 pub mod plugin_check;
 mod realtime;
 mod run_spec;
+pub mod seating;
 mod services;
 mod stop;
 mod wait;

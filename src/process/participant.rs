@@ -7,7 +7,7 @@ use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::lockstep::{
     ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Handover, Identity,
-    LockstepError, Progress,
+    LockstepError, Progress, RefusedFrames,
 };
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::transport::iox::{RunName, RunSpace};
@@ -19,12 +19,14 @@ use std::time::Duration;
 /// dies is noticed at once, and this bounds the wait for one that hangs.
 const BETWEEN_EVENTS: Duration = Duration::from_secs(3600);
 
-/// Runs a coordinator process to the end of the run.
+/// Runs a coordinator process to the end of the run; then `refused` is told whose frames it has refused, also
+/// when it fails.
 pub fn run_coordinator(
     run: &RunName,
     joining: Joining,
     peer_timeout: Duration,
     settling: &Settling<'_>,
+    refused: &dyn Fn(RefusedFrames),
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
     let space = RunSpace::enter(run)?;
@@ -66,16 +68,20 @@ pub fn run_coordinator(
     // Declared last, so let go first.
     let _held = held;
     let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
-    Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world())
-        .drive(&mut driver, || attachment.catch_up(stop))
+    let mut waiter = Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world());
+    let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
+    driver.refused().into_iter().for_each(refused);
+    end
 }
 
-/// Runs a controller process with the built-in law to the end of the run.
+/// Runs a controller process with the built-in law to the end of the run; then `refused` is told whose frames it
+/// has refused, also when it fails.
 pub fn run_controller(
     run: &RunName,
     joining: Joining,
     peer_timeout: Duration,
     settling: &Settling<'_>,
+    refused: &dyn Fn(RefusedFrames),
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
     let space = RunSpace::enter(run)?;
@@ -106,8 +112,10 @@ pub fn run_controller(
     // Declared last, so let go first.
     let _held = held;
     let patience = Patience::of(wait, Role::Controller, 1 + controllers as usize, peer_timeout);
-    Waiter::new(patience, bell, stop.clone(), attachment.world())
-        .drive(&mut driver, || attachment.catch_up(stop))
+    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world());
+    let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
+    driver.refused().into_iter().for_each(refused);
+    end
 }
 
 impl<S, N, O, A> Participant for CoordinatorDriver<S, N, O, A>

@@ -35,10 +35,12 @@ impl Peers {
 
 /// Whether a process exists and is not merely waiting to be reaped.
 pub(super) fn is_alive(process_id: u32) -> bool {
+    // The id may come from anybody; what no process can have means a group elsewhere.
+    let Some(id) = i32::try_from(process_id).ok().filter(|id| *id > 0) else { return false };
     match std::fs::read_to_string(format!("/proc/{process_id}/stat")) {
         // The state follows the command name, which is in parentheses and may hold any character.
         Ok(stat) => stat.rsplit(')').next().is_some_and(|rest| !rest.trim_start().starts_with(['Z', 'X'])),
-        Err(_) => rustix::process::Pid::from_raw(process_id as i32)
+        Err(_) => rustix::process::Pid::from_raw(id)
             .is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok()),
     }
 }

@@ -58,6 +58,7 @@ pub enum Rule {
     Zone,
     Finite,
     Limits,
+    Verdict,
     EmptyZone,
     Pause,
     HardBraking,
@@ -69,7 +70,7 @@ pub enum Rule {
 
 impl Rule {
     /// All rules, in the order of the report.
-    pub const ALL: [Rule; 21] = [
+    pub const ALL: [Rule; 22] = [
         Rule::Attach,
         Rule::Schema,
         Rule::Run,
@@ -84,6 +85,7 @@ impl Rule {
         Rule::Zone,
         Rule::Finite,
         Rule::Limits,
+        Rule::Verdict,
         Rule::EmptyZone,
         Rule::Pause,
         Rule::HardBraking,
@@ -110,6 +112,7 @@ impl Rule {
             Rule::Zone => "names the vehicle's zone (zone)",
             Rule::Finite => "sends numbers (u_mps2, planned exit)",
             Rule::Limits => "keeps the vehicles' limits (u_mps2)",
+            Rule::Verdict => "gives a verdict from 0 to 3 (verdict)",
             Rule::EmptyZone => "answers steps without vehicles",
             Rule::Pause => "waits for a world that pauses",
             Rule::HardBraking => "goes on while a leader brakes to a stop",
@@ -304,7 +307,7 @@ impl Kit<'_> {
                 // What it had sent, if anything, is of the past.
                 while self.commands.receive()?.is_some() {}
                 self.reception.vacate(INDEX as usize);
-                (self.reception.under_way, self.reception.first_step) = (true, step);
+                self.reception.go_on_from(step);
                 self.start()?;
                 if !self.admit(Rule::Restart)? {
                     return Ok(());
@@ -452,6 +455,7 @@ impl Kit<'_> {
                 CommandFault::OtherZone { .. } => Rule::Zone,
                 CommandFault::NotFinite { .. } | CommandFault::BadIntent { .. } => Rule::Finite,
                 CommandFault::OutOfLimits { .. } => Rule::Limits,
+                CommandFault::BadVerdict { .. } => Rule::Verdict,
             };
             self.breach(rule, fault.to_string());
             self.world.forget_commands();

@@ -93,10 +93,12 @@ pub fn run_world(
     let first_step = world.step();
     let mut ledger =
         (options.keeps() || resume.is_some()).then(|| Ledger::new(scenario, options.controllers));
+    let mut missed = false;
     // Behind these the file may be cut off.
     for step in resume.iter().flat_map(|reader| reader.steps().take(first_step as usize)) {
         let step = step.map_err(ReplayError::from)?;
         ledger.iter_mut().for_each(|ledger| ledger.relive(&step));
+        missed = step.misses != 0;
     }
     let WorldOptions { coordinators, controllers, wait, .. } = *options;
     if wait == WaitMode::Spin {
@@ -133,6 +135,9 @@ pub fn run_world(
 
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
     driver.keep(ledger);
+    if missed {
+        driver.go_on_after_miss();
+    }
     if let Some(steps) = observed {
         driver.observe(Box::new(steps));
     }

@@ -17,8 +17,9 @@ use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 /// First bytes of a recording.
 pub const FILE_MAGIC: [u8; 8] = *b"CZLOG\r\n\x1a";
-/// The version of the format.
-pub const FORMAT_VERSION: u32 = 1;
+/// The version of the format, which changes with what is encoded in the metadata and the footer too: 2 since
+/// scenarios have faults. Records have a version of their own, the schema hash.
+pub const FORMAT_VERSION: u32 = 2;
 
 pub(super) const END_MAGIC: [u8; 8] = *b"CZend\0\0\x01";
 pub(super) const TAIL_MAGIC: [u8; 8] = *b"CZtail\0\x01";

@@ -4,7 +4,7 @@
 //! footer, and for whoever asks at the end. What has been written is handed to the system every 100 ms, so a
 //! program that is killed loses no more than that; at the end it is forced onto the disk.
 
-use super::block::StepFrames;
+use super::block::{Step, StepFrames};
 use super::format::{FILE_MAGIC, Metadata, RunEnd};
 use super::writer::{WriteError, Writer};
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
@@ -142,12 +142,20 @@ impl Recorder {
     pub fn push_or_wait(&mut self, frames: &StepFrames<'_>) -> bool {
         let mut block = self.buffer();
         frames.encode_onto(&mut block);
+        self.enqueue_or_wait(frames.header.step, block)
+    }
+
+    /// Records a step that was read from another recording; waits while the queue is full.
+    pub fn push_step_or_wait(&mut self, step: &Step) -> bool {
+        self.enqueue_or_wait(step.header.step, step.encode())
+    }
+
+    fn enqueue_or_wait(&mut self, step: u64, block: Vec<u8>) -> bool {
         let length = block.len();
         while !self.has_room(length) && !self.thread.is_finished() {
             // Bytes are the tighter limit only for steps so large that writing one takes milliseconds.
             std::thread::sleep(Duration::from_millis(1));
         }
-        let step = frames.header.step;
         self.advance(step);
         self.waiting_bytes.fetch_add(length, Ordering::Relaxed);
         let sent = self.queue.send(Message::Block(block)).is_ok();

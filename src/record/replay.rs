@@ -252,9 +252,11 @@ impl WorldReplay {
             return Err(refused(format!("they are of {} controllers, not {senders}", step.commands.len())));
         }
         for (index, part) in (0..).zip(&step.commands) {
-            world
-                .command(index, &part.records)
-                .map_err(|fault| refused(format!("controller {index}: {fault}")))?;
+            let taken = match step.missed(index as usize) {
+                true => world.put_in(index, &part.records),
+                false => world.command(index, &part.records),
+            };
+            taken.map_err(|fault| refused(format!("controller {index}: {fault}")))?;
         }
         world.advance().map_err(|count| refused(format!("{count} vehicles are commanded by nobody")))
     }

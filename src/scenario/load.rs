@@ -15,10 +15,10 @@ mod sections;
 mod table;
 mod topology;
 
-pub use error::{Place, ScenarioError};
+pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;
 
-use super::{Network, Road, Scenario, ShieldMode, embedded};
+use super::{Network, Road, Scenario, ShieldMode, embedded, ranges};
 use demand::{DemandReader, TraceBase};
 pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
@@ -234,14 +234,14 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
 
 /// `dt_s` as nanoseconds.
 fn dt_ns(root: &Table<'_>) -> Result<u64, ScenarioError> {
-    const EXPECTED: &str = "a step > 0 s that is a whole number of nanoseconds";
+    let expected = format!("{}, a whole number of nanoseconds", ranges::STEP);
     // Decimal fractions of a second are not exact in binary: a relative error of some bits is no fraction
     // of a nanosecond.
     let whole = |dt_s: f64| {
         let ns = dt_s * 1e9;
-        dt_s > 0.0 && dt_s <= MAX_TIME_S && ns.round() >= 1.0 && (ns - ns.round()).abs() <= 1e-12 * ns
+        ranges::STEP.contains(dt_s) && (ns - ns.round()).abs() <= 1e-12 * ns
     };
-    Ok((root.f64_or("dt_s", 0.1, whole, EXPECTED)? * 1e9).round() as u64)
+    Ok((root.f64_or("dt_s", 0.1, whole, &expected)? * 1e9).round() as u64)
 }
 
 /// `[end]`: greatest number of vehicles, and time in s.
@@ -253,7 +253,8 @@ fn end(table: Option<&Table<'_>>, dt_s: f64) -> Result<(Option<u32>, f64), Scena
         Some(field) => Some(field.integer(1, "an integer from 1 to 4294967295")?),
         None => None,
     };
-    let time_ok = |time| time >= dt_s && time <= MAX_TIME_S;
-    let expected = format!("a time from dt_s = {dt_s} to {MAX_TIME_S:e} s");
+    let longest_s = MAX_TIME_S.min(dt_s * ranges::MAX_STEPS);
+    let time_ok = |time| time >= dt_s && time <= longest_s;
+    let expected = format!("a time from dt_s = {dt_s} to {longest_s:e} s");
     Ok((vehicles, t.f64_or("time_s", DEFAULT_TIME_S, time_ok, &expected)?))
 }

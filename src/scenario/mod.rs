@@ -13,6 +13,7 @@ pub mod load;
 pub mod network;
 pub mod params;
 pub mod plugins;
+mod ranges;
 pub mod share;
 
 pub use arrivals::ArrivalStream;

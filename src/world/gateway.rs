@@ -95,6 +95,19 @@ pub enum CommandFault {
         /// Greatest allowed.
         max_mps2: f64,
     },
+    /// The verdict is one that only the world gives, or has no meaning.
+    #[error(
+        "record {record}, field verdict: vehicle {vehicle} has verdict {verdict}, expected 0 to {}",
+        frames::VERDICT_INFEASIBLE
+    )]
+    BadVerdict {
+        /// Place in the frame.
+        record: usize,
+        /// The vehicle.
+        vehicle: u32,
+        /// Verdict claimed.
+        verdict: u16,
+    },
     /// The planned exit, which other vehicles may read, is not a number.
     #[error("record {record}, field planned_exit_time_s or planned_exit_speed_mps: not finite")]
     BadIntent {
@@ -166,7 +179,7 @@ impl World {
         &self.gateway.drivers
     }
 
-    /// Takes one controller's commands for the present step.
+    /// Takes one controller's commands for the present step, as they came from it.
     ///
     /// With the shield on, an acceleration that is no number becomes `u_min` and one beyond the limits the
     /// limit, and both are counted; otherwise they are faults.
@@ -175,6 +188,24 @@ impl World {
     /// What is wrong with the first bad record. The frame does not count then; another must come before the
     /// step can be integrated.
     pub fn command(&mut self, sender: u32, commands: &[VehicleCommand]) -> Result<(), CommandFault> {
+        self.take(sender, commands, frames::VERDICT_INFEASIBLE)
+    }
+
+    /// The same for what the world puts in a controller's place (see [`substitute`](Self::substitute)): only
+    /// then may a verdict say so. Such commands have no way to go, so no fault on the way reaches them.
+    ///
+    /// # Errors
+    /// As above.
+    pub fn put_in(&mut self, controller: u32, commands: &[VehicleCommand]) -> Result<(), CommandFault> {
+        self.take(controller, commands, frames::VERDICT_FALLBACK)
+    }
+
+    fn take(
+        &mut self,
+        sender: u32,
+        commands: &[VehicleCommand],
+        greatest_verdict: u16,
+    ) -> Result<(), CommandFault> {
         let limits = self.scenario.vehicle;
         let Gateway { mode, drivers, rows, falls_back, .. } = &mut self.gateway;
         let (mut beyond, mut not_finite) = (0, 0);
@@ -208,6 +239,10 @@ impl World {
                 }
                 if !(command.planned_exit_time_s.is_finite() && command.planned_exit_speed_mps.is_finite()) {
                     return Err(CommandFault::BadIntent { record });
+                }
+                if command.verdict > greatest_verdict {
+                    let verdict = command.verdict;
+                    return Err(CommandFault::BadVerdict { record, vehicle, verdict });
                 }
                 let mut u = command.u_mps2;
                 let (min_mps2, max_mps2) = (limits.u_min_mps2, limits.u_max_mps2);

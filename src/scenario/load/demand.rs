@@ -2,7 +2,7 @@
 
 use super::error::{Place, ScenarioError, nearest};
 use super::table::{Field, Table};
-use crate::scenario::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution, VehicleParams};
+use crate::scenario::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution, VehicleParams, ranges};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::rc::Rc;
@@ -59,7 +59,7 @@ impl DemandReader<'_> {
     }
 
     fn poisson(&self, t: &Table<'_>, rates: &Field<'_>) -> Result<Demand, ScenarioError> {
-        let min_headway_s = t.f64("min_headway_s", |h| h >= 0.0, "a time >= 0 s")?;
+        let min_headway_s = t.within("min_headway_s", &ranges::HEADWAY)?;
         const RATES: &str = "a list of {until_s = TIME, vehicles_per_hour = RATE}";
         let mut periods: Vec<RatePeriod> = Vec::new();
         for item in rates.items(RATES)? {

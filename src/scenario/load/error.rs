@@ -150,3 +150,11 @@ pub(super) fn nearest<'a>(word: &str, candidates: impl IntoIterator<Item = &'a s
         .max_by(|a, b| a.0.total_cmp(&b.0))
         .map(|(_, c)| c.into())
 }
+
+/// The text in one line: characters that would end it, or move the cursor, are written as escapes.
+pub fn printable(text: &str) -> String {
+    let escaped = |c: char| -> Box<dyn Iterator<Item = char>> {
+        if c.is_control() { Box::new(c.escape_default()) } else { Box::new(std::iter::once(c)) }
+    };
+    text.chars().flat_map(escaped).collect()
+}

@@ -1,7 +1,7 @@
 //! `--set key=value`: values written over those of the scenario file.
 
 use super::document::{Document, Node, Origin, Value, parse_value};
-use super::error::{ScenarioError, nearest};
+use super::error::{ScenarioError, nearest, printable};
 use std::collections::BTreeMap;
 use std::str::FromStr;
 
@@ -13,6 +13,7 @@ use std::str::FromStr;
 /// inline table.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Override {
+    /// What follows `--set`, in one line.
     text: String,
     path: Vec<String>,
     value: String,
@@ -22,7 +23,8 @@ impl FromStr for Override {
     type Err = ScenarioError;
 
     fn from_str(text: &str) -> Result<Self, ScenarioError> {
-        let error = |message: String| ScenarioError::Override { set: text.to_owned(), message };
+        let shown = printable(text);
+        let error = |message: String| ScenarioError::Override { set: shown.clone(), message };
         let (key, value) =
             text.split_once('=').ok_or_else(|| error("no '='; expected key=value".to_owned()))?;
         let path: Vec<String> = key.split('.').map(|part| part.trim().to_owned()).collect();
@@ -41,7 +43,7 @@ impl FromStr for Override {
         {
             return Err(error(format!("not valid TOML: {message}; expected a TOML value")));
         }
-        Ok(Self { text: text.to_owned(), path, value })
+        Ok(Self { text: shown, path, value })
     }
 }
 
@@ -69,7 +71,9 @@ impl Override {
         part: &str,
         origin: Origin,
     ) -> Result<&'a mut Node, ScenarioError> {
-        let error = |message: String| Err(ScenarioError::Override { set: self.text.clone(), message });
+        let error = |message: String| {
+            Err(ScenarioError::Override { set: self.text.clone(), message: printable(&message) })
+        };
         let parent = self.path[..depth].join(".");
         match &mut node.value {
             Value::Table(table) => Ok(table

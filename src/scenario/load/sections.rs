@@ -4,7 +4,7 @@ use super::error::ScenarioError;
 use super::table::Table;
 use crate::scenario::{
     Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
-    Segment, Solver, VehicleParams,
+    Segment, Solver, VehicleParams, ranges,
 };
 
 /// `[vehicle]`, or the defaults.
@@ -29,37 +29,38 @@ pub(super) fn vehicle(table: Option<&Table<'_>>) -> Result<VehicleParams, Scenar
         "standstill_gap_m",
     ])?;
     let p = &mut params;
-    p.u_min_mps2 = t.f64_or("u_min_mps2", p.u_min_mps2, |u| u < 0.0, "an acceleration < 0 m/s^2")?;
-    p.u_max_mps2 = t.f64_or("u_max_mps2", p.u_max_mps2, |u| u > 0.0, "an acceleration > 0 m/s^2")?;
-    p.v_min_mps = t.f64_or("v_min_mps", p.v_min_mps, |v| v >= 0.0, "a speed >= 0 m/s")?;
+    p.u_min_mps2 = t.within_or("u_min_mps2", p.u_min_mps2, &ranges::BRAKING)?;
+    p.u_max_mps2 = t.within_or("u_max_mps2", p.u_max_mps2, &ranges::ACCELERATION)?;
+    p.v_min_mps = t.within_or("v_min_mps", p.v_min_mps, &ranges::LEAST_SPEED)?;
     let v_min = p.v_min_mps;
-    p.v_max_mps =
-        t.f64_or("v_max_mps", p.v_max_mps, |v| v > v_min, &format!("a speed > v_min_mps = {v_min} m/s"))?;
-    p.length_m = t.f64_or("length_m", p.length_m, |l| l > 0.0, "a length > 0 m")?;
-    p.reaction_time_s = t.f64_or("reaction_time_s", p.reaction_time_s, |r| r > 0.0, "a time > 0 s")?;
-    p.standstill_gap_m = t.f64_or("standstill_gap_m", p.standstill_gap_m, |g| g >= 0.0, "a gap >= 0 m")?;
+    let is_greatest = |v| v > v_min && ranges::GREATEST_SPEED.contains(v);
+    let expected = format!("{}, > v_min_mps = {v_min}", ranges::GREATEST_SPEED);
+    p.v_max_mps = t.f64_or("v_max_mps", p.v_max_mps, is_greatest, &expected)?;
+    p.length_m = t.within_or("length_m", p.length_m, &ranges::VEHICLE_LENGTH)?;
+    p.reaction_time_s = t.within_or("reaction_time_s", p.reaction_time_s, &ranges::REACTION_TIME)?;
+    p.standstill_gap_m = t.within_or("standstill_gap_m", p.standstill_gap_m, &ranges::STANDSTILL_GAP)?;
     Ok(params)
 }
 
 /// `[objective]`: beta, in m^2/s^4, given or from alpha.
 pub(super) fn beta(table: &Table<'_>, vehicle: &VehicleParams) -> Result<f64, ScenarioError> {
     const ALPHA: &str = "a weight with 0 < alpha < 1";
-    const BETA: &str = "a weight > 0 m^2/s^4";
     table.only(&["alpha", "beta"])?;
     match table.either("alpha", "beta") {
         (Some(_), Some(beta)) => {
             Err(beta.bad_because(Some("alpha is given as well".into()), "either alpha or beta"))
         }
-        (None, None) => Err(table.missing("beta", &format!("{BETA}, or alpha instead"))),
-        (None, Some(beta)) => beta.f64(|b| b > 0.0, BETA),
+        (None, None) => Err(table.missing("beta", &format!("{}, or alpha instead", ranges::BETA))),
+        (None, Some(beta)) => beta.within(&ranges::BETA),
         (Some(field), None) => {
             let alpha = field.f64(|a| a > 0.0 && a < 1.0, ALPHA)?;
             let u = vehicle.u_max_mps2.max(-vehicle.u_min_mps2);
             let beta = alpha * u * u / (2.0 * (1.0 - alpha));
-            if beta.is_finite() && beta > 0.0 {
+            if ranges::BETA.contains(beta) {
                 Ok(beta)
             } else {
-                Err(field.bad_because(Some(format!("it gives beta = {beta}")), ALPHA))
+                let expected = format!("{ALPHA} that gives {} as beta", ranges::BETA);
+                Err(field.bad_because(Some(format!("it gives beta = {beta:?}")), &expected))
             }
         }
     }
@@ -100,7 +101,7 @@ pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlPar
         "fe_conditions",
         "fe_fraction",
     ])?;
-    let gain = |key, default| t.f64_or(key, default, |k| k > 0.0, "a gain > 0 1/s");
+    let gain = |key, default| t.within_or(key, default, &ranges::GAIN);
     let p = &mut params;
     p.reference = t.choice_or_first(
         "reference",
@@ -122,7 +123,7 @@ pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlPar
     p.k_merge_per_s = gain("k_merge_per_s", p.k_merge_per_s)?;
     p.k_speed_per_s = gain("k_speed_per_s", p.k_speed_per_s)?;
     p.clf_rate_per_s = gain("clf_rate_per_s", p.clf_rate_per_s)?;
-    p.slack_weight = t.f64_or("slack_weight", p.slack_weight, |w| w >= 0.0, "a weight >= 0")?;
+    p.slack_weight = t.within_or("slack_weight", p.slack_weight, &ranges::SLACK_WEIGHT)?;
     p.clf = t.bool_or("clf", p.clf)?;
     p.feasibility_rows = t.bool_or("feasibility_rows", p.feasibility_rows)?;
     p.fe_conditions = t.choice_or_first(
@@ -191,8 +192,7 @@ pub(super) fn flow(
     t.blame(&policy);
 
     let v_max = vehicle.v_max_mps;
-    let is_speed = |v| v > 0.0 && v <= v_max;
-    let speed = format!("a speed with 0 < v <= v_max_mps = {v_max} m/s");
+    let (is_speed, speed) = flow_speed(v_max);
     if kind == Kind::None {
         return Ok(FlowPolicy::None);
     }
@@ -209,11 +209,11 @@ pub(super) fn flow(
         "a length with 0 < l <= {longest} m, the longest approach of the zone downstream, {}",
         downstream.zone
     );
-    let gain_mps = t.f64("gain_mps", |k| k >= 0.0, "a gain >= 0 m/s per vehicle")?;
+    let gain_mps = t.within("gain_mps", &ranges::FLOW_GAIN)?;
     let min_mps = t.f64_or("min_mps", 5.0, is_speed, &speed)?;
     if kind == Kind::MeanSpeed {
         return Ok(FlowPolicy::MeanSpeed {
-            offset_mps: t.f64("offset_mps", |_| true, "a finite speed difference in m/s")?,
+            offset_mps: t.within("offset_mps", &ranges::FLOW_OFFSET)?,
             gain_mps,
             segment_m: t.f64("segment_m", segment_ok, &segment)?,
             min_mps,
@@ -226,15 +226,20 @@ pub(super) fn flow(
     Ok(FlowPolicy::Feedback { baseline: baseline(&t, v_max)?, gain_mps, segment, min_mps })
 }
 
+/// Whether a speed is one that vehicles may be told to leave at, and what is expected.
+fn flow_speed(v_max: f64) -> (impl Fn(f64) -> bool + Copy, String) {
+    let expected = format!("{} and <= v_max_mps = {v_max}", ranges::FLOW_SPEED);
+    (move |v| ranges::FLOW_SPEED.contains(v) && v <= v_max, expected)
+}
+
 /// `baseline_mps`: a speed, or "optimal" with the entry speeds to take the mean over.
 fn baseline(t: &Table<'_>, v_max: f64) -> Result<Baseline, ScenarioError> {
-    let is_speed = |v| v > 0.0 && v <= v_max;
-    let speed = format!("a speed with 0 < v <= v_max_mps = {v_max} m/s");
+    let (is_speed, speed) = flow_speed(v_max);
     let expected = format!("{speed}, or \"optimal\"");
     let field = t.need("baseline_mps", &expected)?;
     let samples = t.get("baseline_entry_speeds_mps");
     if field.str("").is_ok_and(|word| word == "optimal") {
-        let list = format!("a list of speeds, each with 0 < v <= v_max_mps = {v_max} m/s");
+        let list = format!("a list of speeds, each {speed}");
         let speeds: Vec<f64> = match samples {
             Some(samples) => {
                 let items = samples.items(&list)?;

@@ -1,7 +1,8 @@
 //! Typed reading of a [`Document`]: every failure names place, key path, value found and what was expected.
 
 use super::document::{Document, Node, Origin, Value};
-use super::error::{Place, ScenarioError, nearest};
+use super::error::{Place, ScenarioError, nearest, printable};
+use crate::scenario::ranges::Range;
 use std::collections::BTreeMap;
 
 /// A table being read.
@@ -71,7 +72,8 @@ impl<'a> Table<'a> {
 
     /// Dotted path of a key of this table.
     pub(super) fn key(&self, key: &str) -> String {
-        if self.path.is_empty() { key.to_owned() } else { format!("{}.{key}", self.path) }
+        let key = printable(key);
+        if self.path.is_empty() { key } else { format!("{}.{key}", self.path) }
     }
 
     /// A key that may be absent.
@@ -132,6 +134,16 @@ impl<'a> Table<'a> {
             None if ok(default) => Ok(default),
             None => Err(self.missing(key, &format!("{expected} (the default {default} is not)"))),
         }
+    }
+
+    /// A number within a range.
+    pub(super) fn within(&self, key: &str, range: &Range) -> Result<f64, ScenarioError> {
+        self.need(key, &range.to_string())?.within(range)
+    }
+
+    /// The same, with a default.
+    pub(super) fn within_or(&self, key: &str, default: f64, range: &Range) -> Result<f64, ScenarioError> {
+        self.f64_or(key, default, |value| range.contains(value), &range.to_string())
     }
 
     /// `true` or `false`, with a default.
@@ -216,6 +228,11 @@ impl<'a> Field<'a> {
             _ => return Err(self.bad(expected)),
         };
         if number.is_finite() && ok(number) { Ok(number) } else { Err(self.bad(expected)) }
+    }
+
+    /// The same.
+    pub(super) fn within(&self, range: &Range) -> Result<f64, ScenarioError> {
+        self.f64(|value| range.contains(value), &range.to_string())
     }
 
     /// An integer within a range.

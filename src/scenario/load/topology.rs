@@ -2,7 +2,7 @@
 
 use super::error::{ScenarioError, nearest};
 use super::table::{Field, Table};
-use crate::scenario::{Approach, Exit, FlowPolicy, Source, Zone};
+use crate::scenario::{Approach, Exit, FlowPolicy, Source, Zone, ranges};
 
 /// No more zones, roads, or approaches of a zone than this: frames carry their indices in 16 bits.
 pub(in crate::scenario) const MAX_COUNT: usize = 65_535;
@@ -124,8 +124,9 @@ impl<'a> Claims<'a> {
         t.only(&["name", "length_m", "road", "zone", "link_m"])?;
         let step_m = self.step_m;
         let why = "v_max_mps * dt_s, so that a vehicle passes at most one boundary per step";
-        let length_m =
-            t.f64("length_m", |l| l > 0.0 && l >= step_m, &format!("a length >= {step_m} m = {why}"))?;
+        let (length, link) = (ranges::APPROACH_LENGTH, ranges::LINK_LENGTH);
+        let expected = format!("{length}, >= {step_m} m = {why}");
+        let length_m = t.f64("length_m", |l| length.contains(l) && l >= step_m, &expected)?;
         let end = (zone as u32, path as u32);
         let source = match t.either("road", "zone") {
             (None, None) => {
@@ -156,12 +157,9 @@ impl<'a> Claims<'a> {
                     let problem = Some(format!("{} claims the exit of this zone already", other.path));
                     return Err(field.bad_because(problem, "a zone whose exit leads nowhere else"));
                 }
-                let link_m = t.f64_or(
-                    "link_m",
-                    0.0,
-                    |l| l == 0.0 || (l > 0.0 && l >= step_m),
-                    &format!("0 (no link), or a length >= {step_m} m = {why}"),
-                )?;
+                let expected = format!("{link}, >= {step_m} m = {why}");
+                let is_link = |l| link.contains(l) && (l == 0.0 || l >= step_m);
+                let link_m = t.f64_or("link_m", 0.0, is_link, &expected)?;
                 self.exits[upstream] = Some((end.0, end.1, link_m));
                 self.exit_fields[upstream] = Some(field);
                 Source::Zone(upstream as u32)

@@ -1,0 +1,85 @@
+//! The ranges values are taken from. They are far wider than any road or vehicle needs, and far narrower than
+//! where formulas overflow, a step never ends, or a frame does not fit into memory.
+
+use std::fmt;
+
+/// Values from one to another, both included.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Range {
+    least: f64,
+    greatest: f64,
+    /// Whether 0 is taken as well.
+    zero: bool,
+    /// What it is a range of, and its unit; for messages.
+    what: &'static str,
+    unit: &'static str,
+}
+
+const fn range(what: &'static str, least: f64, greatest: f64, unit: &'static str) -> Range {
+    Range { least, greatest, zero: false, what, unit }
+}
+
+/// `dt_s`.
+pub(super) const STEP: Range = range("a step", 1e-4, 10.0, "s");
+/// `vehicle.u_min_mps2`.
+pub(super) const BRAKING: Range = range("an acceleration", -100.0, -0.01, "m/s^2");
+/// `vehicle.u_max_mps2`.
+pub(super) const ACCELERATION: Range = range("an acceleration", 0.01, 100.0, "m/s^2");
+/// `vehicle.v_min_mps`.
+pub(super) const LEAST_SPEED: Range = range("a speed", 0.0, 1000.0, "m/s");
+/// `vehicle.v_max_mps`.
+pub(super) const GREATEST_SPEED: Range = range("a speed", 0.1, 1000.0, "m/s");
+/// `vehicle.length_m`.
+pub(super) const VEHICLE_LENGTH: Range = range("a length", 0.01, 1000.0, "m");
+/// `vehicle.reaction_time_s`.
+pub(super) const REACTION_TIME: Range = range("a time", 0.001, 100.0, "s");
+/// `vehicle.standstill_gap_m`.
+pub(super) const STANDSTILL_GAP: Range = range("a gap", 0.0, 1000.0, "m");
+/// `objective.beta`, also where it comes from `alpha`.
+pub(super) const BETA: Range = range("a weight", 1e-6, 1e6, "m^2/s^4");
+/// `control.k_*_per_s` and `control.clf_rate_per_s`.
+pub(super) const GAIN: Range = range("a gain", 1e-6, 1e6, "1/s");
+/// `control.slack_weight`.
+pub(super) const SLACK_WEIGHT: Range = Range { zero: true, ..range("a weight", 1e-6, 1e6, "m^2/s^4") };
+/// `zones.approaches.length_m`. A frame has room for the vehicles that fit.
+pub(super) const APPROACH_LENGTH: Range = range("a length", 1.0, 1e6, "m");
+/// `zones.approaches.link_m`.
+pub(super) const LINK_LENGTH: Range = Range { zero: true, ..range("a length", 1.0, 1e6, "m") };
+/// Terminal speeds of flow policies, which do not exceed `v_max_mps` either.
+pub(super) const FLOW_SPEED: Range = range("a speed", 0.01, 1000.0, "m/s");
+/// `gain_mps` of flow policies.
+pub(super) const FLOW_GAIN: Range = range("a gain", 0.0, 1000.0, "m/s per vehicle");
+/// `offset_mps` of a flow policy.
+pub(super) const FLOW_OFFSET: Range = range("a speed difference", -1000.0, 1000.0, "m/s");
+/// `min_headway_s` of random arrivals.
+pub(super) const HEADWAY: Range = range("a time", 0.0, 1e6, "s");
+
+/// No run has more steps than this.
+pub(super) const MAX_STEPS: f64 = 1e9;
+
+impl Range {
+    /// Whether the value is one of them; NaN is not.
+    pub fn contains(&self, value: f64) -> bool {
+        (self.zero && value == 0.0) || (self.least..=self.greatest).contains(&value)
+    }
+}
+
+/// What is expected, in words.
+impl fmt::Display for Range {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Range { least, greatest, zero, what, unit } = *self;
+        let zero = if zero { "0, or " } else { "" };
+        write!(f, "{zero}{what} from {} to {} {unit}", Short(least), Short(greatest))
+    }
+}
+
+/// A number with its zeros in the exponent when they are many.
+struct Short(f64);
+
+impl fmt::Display for Short {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let size = self.0.abs();
+        let is_plain = size == 0.0 || (1e-3..1e5).contains(&size);
+        if is_plain { write!(f, "{}", self.0) } else { write!(f, "{:e}", self.0) }
+    }
+}
