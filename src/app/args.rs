@@ -171,7 +171,7 @@ pub(super) struct Standalone<A: Args> {
 #[derive(Clone, Debug, Args)]
 pub(super) struct ScenarioArgs {
     /// Scenario: a TOML file, or one of the embedded two-merges (default), varying-demand, corridor-8,
-    /// tree.
+    /// tree, faulty-sensors.
     pub scenario: Option<String>,
     /// Seed of all random streams, in place of the scenario's.
     #[arg(long, value_name = "N")]

@@ -189,10 +189,10 @@ struct Member {
 
 impl Family {
     fn start(&mut self, plan: &Plan<'_>, observed: bool) -> Result<(), AppError> {
-        let mut common: Vec<String> = ["--run", &plan.run.to_string()].map(str::to_owned).to_vec();
-        common.extend(["--supervised".to_owned(), std::process::id().to_string()]);
-        let mut world = common.clone();
-        common.extend(plan.conduct.wait.to_flags());
+        let (run, supervisor) = (plan.run.to_string(), std::process::id().to_string());
+        let common = ["--run", &run, "--supervised", &supervisor].map(str::to_owned);
+        let participant = [&common[..], &plan.conduct.wait.to_flags()].concat();
+        let mut world = common.to_vec();
         world.extend(["--ctrl-procs".to_owned(), plan.share.ctrl_procs.to_string()]);
         world.extend(["--coord-procs".to_owned(), plan.share.coord_procs.to_string()]);
         world.extend(plan.conduct.to_flags());
@@ -205,7 +205,7 @@ impl Family {
             [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
         {
             for index in 0..count {
-                let mut arguments = common.clone();
+                let mut arguments = participant.clone();
                 arguments.extend(["--index".to_owned(), index.to_string()]);
                 self.spawn(Part { name: format!("{role} {index}"), command, arguments, restarts: 0 })?;
             }
