@@ -267,3 +267,30 @@ fn clarabel_is_retried_where_it_cycles() {
     let u = clarabel::solve(&tracking, &program.list()).expect("0 is feasible");
     assert!(u.abs() <= 1e-6, "{u}");
 }
+
+/// A slack of 150 over the whole feasible set keeps every attempt from the tolerance asked for: the first
+/// stalls next to the optimum, the last 4e-7 beyond a row, which is no proof that nothing satisfies the rows.
+#[test]
+fn clarabel_is_believed_where_it_stalls_next_to_the_optimum() {
+    let tracking = Tracking {
+        u_ref_mps2: 1.6345499838654811,
+        error_mps: -24.82493108058734,
+        clf_rate_per_s: 12.659730617512835,
+        slack_weight: 3.603168538672143,
+    };
+    let upper = [
+        (1.0, 25.481191939658103),
+        (1.8, 46.76882292467465),
+        (1.0, 20.281102870741126),
+        (1.649472170119076, 6.628471430508238),
+        (1.0813385450861541, 11.224027960268186),
+    ];
+    let program = Program {
+        limits: (-4.0, 4.0),
+        at_least: vec![-4.518808060341896],
+        at_most: upper.map(|(coefficient, bound)| Inequality { coefficient, bound }).into(),
+    };
+    assert_eq!(qp::solve(&tracking, &program.interval()), Some(4.0));
+    let u = clarabel::solve(&tracking, &program.list()).expect("4 is feasible");
+    assert!((u - 4.0).abs() <= 1e-9, "{u}");
+}

@@ -45,8 +45,9 @@ impl Run {
             let goes_on = process.step().unwrap();
             process
                 .frames(|frames| {
-                    let mut block = vec![0; frames.encoded_len()];
-                    frames.encode_into(&mut block);
+                    let mut block = Vec::new();
+                    frames.encode_onto(&mut block);
+                    assert_eq!(block.len(), frames.encoded_len());
                     steps.push(Step::decode(&block).unwrap());
                 })
                 .unwrap();

@@ -4,43 +4,21 @@
 
 mod common;
 
-use common::{Ended, Process, Site, children, send, ticks, wait_until};
+use common::{Ended, LONG_RUN, Process, Site, children, part, send, ticks, wait_until};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::process::Signal;
 use std::time::Duration;
 
-/// Steady traffic through two zones for 100 000 steps: long enough to be disturbed in the middle of.
-const LONG: [&str; 11] = [
-    "varying-demand",
-    "--set",
-    "end.time_s=10000",
-    "--set",
-    "roads.main1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
-    "--set",
-    "roads.merge1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
-    "--set",
-    "roads.merge2.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
-    "--json",
-    "-",
-];
-
 fn undisturbed() -> String {
-    Site::new("u").start("cz", &[&LONG[..], &["--in-process"]].concat()).ended().hash()
+    common::hash(&Site::new("u").summary(&[&LONG_RUN[..], &["--in-process"]].concat()))
 }
 
 /// A supervised run that steps.
 fn begin(site: &Site, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
-    let supervisor = site.start("cz", &[&LONG, arguments].concat());
-    let mut parts = Vec::new();
-    wait_until("the supervisor to have started the parts", || {
-        parts = children(supervisor.id())
-            .into_iter()
-            .filter_map(|(id, line)| line.get(1).filter(|part| *part != "run").map(|p| (p.clone(), id)))
-            .collect();
-        parts.len() == processes
-    });
-    let world = parts.iter().find(|(part, _)| part == "world").unwrap().1;
+    let json = ["--json", "-"];
+    let (supervisor, parts) = common::begin(site, &[&LONG_RUN[..], &json, arguments].concat(), processes);
+    let world = part(&parts, "world");
     wait_until("the world to be stepping", || ticks(world) >= 5);
     (supervisor, parts)
 }
@@ -57,10 +35,10 @@ fn disturb(
     std::thread::sleep(after);
     let mut killed = 0;
     for victim in victims {
-        let (_, id) = parts.iter().find(|(part, _)| part == victim).unwrap();
+        let id = part(&parts, victim);
         // The run may be over; then there is nobody to be killed.
-        killed += usize::from(common::is_alive(*id));
-        send_if_alive(*id);
+        killed += usize::from(common::is_alive(id));
+        send_if_alive(id);
     }
     (supervisor.ended(), killed)
 }
@@ -146,7 +124,7 @@ fn a_part_killed_again_and_again_is_replaced_each_time() {
 fn parts_started_by_hand_leave_and_rejoin() {
     let expected = undisturbed();
     let site = Site::new("rejoin");
-    let world = site.start("cz-world", &LONG);
+    let world = site.start("cz-world", &[&LONG_RUN[..], &["--json", "-"]].concat());
     let coordinator = site.start("cz-coord", &[]);
     let controller = site.start("cz-ctrl", &[]);
     wait_until("the world to be stepping", || ticks(world.id()) >= 5);
@@ -175,7 +153,7 @@ fn nobody_joins_a_run_in_which_nobody_is_missing() {
 #[test]
 fn a_world_nobody_comes_back_to_gives_up_and_says_for_whom_it_waited() {
     let site = Site::new("lost");
-    let world = site.start("cz-world", &[&LONG[..], &["--peer-timeout", "1"]].concat());
+    let world = site.start("cz-world", &[&LONG_RUN[..], &["--peer-timeout", "1"]].concat());
     let coordinator = site.start("cz-coord", &[]);
     let controller = site.start("cz-ctrl", &[]);
     wait_until("the world to be stepping", || ticks(world.id()) >= 5);

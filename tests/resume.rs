@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Process, Site, children, is_alive, send, ticks, wait_until};
+use common::{LONG_RUN, Process, Site, children, is_alive, part, send, ticks, wait_until};
 use control_zones::record::{Reader, Writer};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -13,39 +13,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};
 use std::time::Duration;
 
-/// Steady traffic through two zones, 100 000 steps.
-const LONG: [&str; 9] = [
-    "varying-demand",
-    "--set",
-    "end.time_s=10000",
-    "--set",
-    "roads.main1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
-    "--set",
-    "roads.merge1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
-    "--set",
-    "roads.merge2.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
-];
-
 fn in_process(site: &Site, arguments: &[&str]) -> String {
     common::hash(&site.summary(&[arguments, &["--in-process"]].concat()))
 }
 
 fn begin(site: &Site, arguments: &[&str], file: &Path, processes: usize) -> (Process, Vec<(String, u32)>) {
-    let record = ["--record", file.to_str().unwrap()];
-    let supervisor = site.start("cz", &[arguments, &record].concat());
-    let mut parts = Vec::new();
-    wait_until("the supervisor to have started the parts", || {
-        parts = children(supervisor.id())
-            .into_iter()
-            .filter_map(|(id, line)| line.get(1).filter(|part| *part != "run").map(|p| (p.clone(), id)))
-            .collect();
-        parts.len() == processes
-    });
-    (supervisor, parts)
-}
-
-fn part(parts: &[(String, u32)], name: &str) -> u32 {
-    parts.iter().find(|(part, _)| part == name).unwrap().1
+    common::begin(site, &[arguments, &["--record", file.to_str().unwrap()]].concat(), processes)
 }
 
 fn cz(site: &Site, arguments: &[&str]) -> Output {
@@ -72,12 +45,12 @@ fn file(directory: &tempfile::TempDir) -> PathBuf {
 fn cut_short(times: usize, victim: &str, shares: &[&str], processes: usize) {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let reference = Site::new("u");
-    let expected = in_process(&reference, &LONG);
+    let expected = in_process(&reference, &LONG_RUN);
     let directory = tempfile::tempdir().unwrap();
     let mut steps = Vec::new();
     while steps.len() < times {
         let (site, file) = (Site::new("cut"), file(&directory));
-        let (supervisor, parts) = begin(&site, &[&LONG[..], shares].concat(), &file, processes);
+        let (supervisor, parts) = begin(&site, &[&LONG_RUN[..], shares].concat(), &file, processes);
         let world = part(&parts, "world");
         wait_until("the world to be stepping", || ticks(world) >= 3 || !is_alive(world));
         std::thread::sleep(Duration::from_millis(rng.random_range(0..150)));
@@ -148,8 +121,8 @@ fn a_resumed_run_is_recorded_with_its_past_and_can_be_resumed_again() {
     let path = |name: &str| directory.path().join(name);
     let (undisturbed, first, second, last) = (path("u"), path("1"), path("2"), path("3"));
     let of = |path: &Path| path.to_str().unwrap().to_owned();
-    let expected = common::hash(&site.summary(&[&LONG[..], &["--record", &of(&undisturbed)]].concat()));
-    let (supervisor, parts) = begin(&site, &LONG, &first, 3);
+    let expected = common::hash(&site.summary(&[&LONG_RUN[..], &["--record", &of(&undisturbed)]].concat()));
+    let (supervisor, parts) = begin(&site, &LONG_RUN, &first, 3);
     wait_until("the run to be under way", || steps_in(&first) > 1000);
     send(part(&parts, "world"), Signal::KILL);
     assert!(!supervisor.ended().status.success());

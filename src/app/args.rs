@@ -171,7 +171,7 @@ pub(super) struct Standalone<A: Args> {
 #[derive(Clone, Debug, Args)]
 pub(super) struct ScenarioArgs {
     /// Scenario: a TOML file, or one of the embedded two-merges (default), varying-demand, corridor-8,
-    /// tree.
+    /// tree, faulty-sensors.
     pub scenario: Option<String>,
     /// Seed of all random streams, in place of the scenario's.
     #[arg(long, value_name = "N")]
@@ -281,6 +281,18 @@ pub(super) struct WaitArgs {
     pub rt: bool,
 }
 
+impl WaitArgs {
+    /// As a process of the run is given them.
+    pub fn to_flags(self) -> Vec<String> {
+        let seconds = |d: Duration| d.as_secs_f64().to_string();
+        let mut flags = vec!["--attach-timeout".to_owned(), seconds(self.attach_timeout)];
+        flags.extend(["--peer-timeout".to_owned(), seconds(self.peer_timeout)]);
+        flags.extend(["--pin".to_owned(), name_of(self.pin)]);
+        flags.extend(self.rt.then(|| "--rt".to_owned()));
+        flags
+    }
+}
+
 fn seconds(text: &str) -> Result<Duration, String> {
     match text.parse::<f64>() {
         Ok(s) if s > 0.0 && s <= 86_400.0 => Ok(Duration::from_secs_f64(s)),
@@ -321,10 +333,8 @@ impl TimingArgs {
 
     /// As a process of the run is given them.
     pub fn to_flags(self) -> Vec<String> {
-        let name =
-            |v: Option<clap::builder::PossibleValue>| v.map_or_else(String::new, |v| v.get_name().to_owned());
-        let mut flags = vec!["--pace".to_owned(), name(self.pace.to_possible_value())];
-        flags.extend(["--on-miss".to_owned(), name(self.on_miss.to_possible_value())]);
+        let mut flags = vec!["--pace".to_owned(), name_of(self.pace)];
+        flags.extend(["--on-miss".to_owned(), name_of(self.on_miss)]);
         flags.extend(self.deadline.map(|d| format!("--deadline={}", d.as_secs_f64())));
         flags
     }
@@ -337,6 +347,37 @@ pub(super) enum Restart {
     Never,
     /// Another process takes its place and goes on to the same result.
     OnFailure,
+}
+
+/// How the processes of a run wait, keep time, and what becomes of those that die.
+#[derive(Clone, Copy, Debug, Args)]
+pub(super) struct ConductArgs {
+    #[command(flatten)]
+    pub wait: WaitArgs,
+    /// How the processes of the run wait for frames.
+    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
+    pub wait_mode: WaitMode,
+    /// What becomes of the run when a coordinator or a process of the built-in pool dies.
+    #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
+    pub restart: Restart,
+    #[command(flatten)]
+    pub timing: TimingArgs,
+}
+
+impl ConductArgs {
+    /// As the world of the run is given them.
+    pub fn to_flags(self) -> Vec<String> {
+        let mut flags = self.wait.to_flags();
+        flags.extend(["--wait".to_owned(), name_of(self.wait_mode)]);
+        flags.extend(["--restart".to_owned(), name_of(self.restart)]);
+        flags.extend(self.timing.to_flags());
+        flags
+    }
+}
+
+/// A choice as it is written on the command line.
+fn name_of(choice: impl ValueEnum) -> String {
+    choice.to_possible_value().map_or_else(String::new, |v| v.get_name().to_owned())
 }
 
 #[derive(Debug, Args)]
@@ -366,15 +407,7 @@ pub(super) struct RunArgs {
     #[arg(long, value_name = "NAME")]
     pub run: Option<RunName>,
     #[command(flatten)]
-    pub wait: WaitArgs,
-    /// How the processes of the run wait for frames.
-    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
-    pub wait_mode: WaitMode,
-    /// What becomes of the run when a coordinator or a process of the built-in pool dies.
-    #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
-    pub restart: Restart,
-    #[command(flatten)]
-    pub timing: TimingArgs,
+    pub conduct: ConductArgs,
 }
 
 #[derive(Debug, Args)]
@@ -390,15 +423,7 @@ pub(super) struct WorldArgs {
     #[arg(long, value_name = "FILE|-")]
     pub json: Option<PathBuf>,
     #[command(flatten)]
-    pub wait: WaitArgs,
-    /// How the processes of the run wait for frames.
-    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
-    pub wait_mode: WaitMode,
-    /// What becomes of the run when a coordinator or a process of the built-in pool dies.
-    #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
-    pub restart: Restart,
-    #[command(flatten)]
-    pub timing: TimingArgs,
+    pub conduct: ConductArgs,
     /// Record every frame of the run in this file (.czlog); an older recording is replaced.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
@@ -512,15 +537,7 @@ pub(super) struct ResumeArgs {
     #[arg(long, value_name = "NAME")]
     pub run: Option<RunName>,
     #[command(flatten)]
-    pub wait: WaitArgs,
-    /// How the processes of the run wait for frames.
-    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
-    pub wait_mode: WaitMode,
-    /// What becomes of the run when a coordinator or a process of the built-in pool dies.
-    #[arg(long, value_enum, default_value_t = Restart::OnFailure)]
-    pub restart: Restart,
-    #[command(flatten)]
-    pub timing: TimingArgs,
+    pub conduct: ConductArgs,
 }
 
 #[derive(Debug, Args)]

@@ -1,14 +1,16 @@
 //! `cz bench`: measurements.
 
-use super::args::{BenchArgs, BenchKind, PeerArgs, Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs};
+use super::args::{
+    BenchArgs, BenchKind, ConductArgs, PeerArgs, Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs,
+};
 use super::record::Recording;
+use super::run::own_name;
 use super::supervise::{Plan, supervise};
 use super::{AppError, print};
 use crate::bench::{
     self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport, Sumo,
 };
 use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, new_run_id, run_in_process};
-use crate::transport::iox::RunName;
 use comfy_table::{CellAlignment, Table, presets};
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -78,10 +80,12 @@ fn run_processes(
         share: ShareArgs { ctrl_procs: controllers, coord_procs: 1 },
         plugins: &[],
         pool: controllers,
-        wait: WAIT,
-        wait_mode: WaitMode::Hybrid,
-        restart: if record.is_some() { Restart::OnFailure } else { Restart::Never },
-        timing: TimingArgs::default(),
+        conduct: ConductArgs {
+            wait: WAIT,
+            wait_mode: WaitMode::Hybrid,
+            restart: if record.is_some() { Restart::OnFailure } else { Restart::Never },
+            timing: TimingArgs::default(),
+        },
         run_id: new_run_id(),
         resume: None,
     };
@@ -98,10 +102,6 @@ fn run_processes(
         recording.finish(&outcome).map_err(words)?;
     }
     outcome.map_err(words)
-}
-
-fn own_name() -> RunName {
-    format!("cz-{}", std::process::id()).parse().expect("letters, a dash and digits are a run name")
 }
 
 fn latency(quick: bool) -> Result<LatencyReport, AppError> {

@@ -47,16 +47,16 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         run: args.run.clone(),
         coordinators: share.coord_procs,
         controllers: scenario.controllers(share.ctrl_procs),
-        attach_timeout: args.wait.attach_timeout,
-        peer_timeout: args.wait.peer_timeout,
-        wait: args.wait_mode,
-        replace: args.restart == Restart::OnFailure,
-        timing: args.timing.timing()?,
+        attach_timeout: args.conduct.wait.attach_timeout,
+        peer_timeout: args.conduct.wait.peer_timeout,
+        wait: args.conduct.wait_mode,
+        replace: args.conduct.restart == Restart::OnFailure,
+        timing: args.conduct.timing.timing()?,
         observed: args.observed || observation.is_some(),
         run_id: Some(run_id),
     };
-    let report = report_to(args.supervised, &args.wait);
-    let settling = settling(&args.wait, &*report);
+    let report = report_to(args.supervised, &args.conduct.wait);
+    let settling = settling(&args.conduct.wait, &*report);
     if args.supervised.is_some() {
         let mut last = Instant::now();
         let outcome = run_world(&scenario, &options, resume.as_ref(), &settling, &stop, |world| {

@@ -43,14 +43,11 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         plugins: &scenario.plugins,
         pool: scenario.controllers(share.ctrl_procs) - scenario.plugins.len() as u32,
         share,
-        wait: args.wait,
-        wait_mode: args.wait_mode,
-        restart: args.restart,
-        timing: args.timing,
+        conduct: args.conduct,
         run_id: new_run_id(),
         resume: Some(&args.file),
     };
-    args.timing.timing()?;
+    args.conduct.timing.timing()?;
     let recording = match &args.record {
         Some(path) => Some(Recording::continuation(path, &reader, &args.file, first, plan.run_id)?),
         None => None,

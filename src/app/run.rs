@@ -21,15 +21,15 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
     let (arguments, scenario) = controllers::load(&arguments, &args.controllers)?;
     let scenario = Arc::new(scenario);
     args.share.check(&scenario)?;
-    if args.wait_mode == WaitMode::Spin && !args.in_process {
+    if args.conduct.wait_mode == WaitMode::Spin && !args.in_process {
         check_cores(1 + (args.share.coord_procs + args.share.ctrl_procs) as usize)?;
     }
     if args.in_process && !scenario.plugins.is_empty() {
         let problem = "--in-process: the scenario has controllers that are processes of their own";
         return Err(AppError::Usage(problem.to_owned()));
     }
-    args.timing.timing()?;
-    if args.in_process && args.timing.is_given() {
+    args.conduct.timing.timing()?;
+    if args.in_process && args.conduct.timing.is_given() {
         let problem =
             "--in-process: nobody else can be late; --pace and --deadline are for several processes";
         return Err(AppError::Usage(problem.to_owned()));
@@ -66,10 +66,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
             plugins: &scenario.plugins,
             pool: scenario.controllers(args.share.ctrl_procs) - scenario.plugins.len() as u32,
             share: args.share,
-            wait: args.wait,
-            wait_mode: args.wait_mode,
-            restart: args.restart,
-            timing: args.timing,
+            conduct: args.conduct,
             run_id: new_run_id(),
             resume: None,
         };
@@ -85,7 +82,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         (Transport::Iceoryx2 { processes }, outcome)
     };
     bar.finish();
-    let asked = args.wait.rt || args.wait.pin != Placement::None;
+    let asked = args.conduct.wait.rt || args.conduct.wait.pin != Placement::None;
     Summary::new(&scenario, transport, outcome?).with_placement(asked).deliver(args.json.as_deref())?;
     // A recording that failed does not take the results with it.
     recorded

@@ -3,8 +3,8 @@
 use super::args::ShowArgs;
 use super::record::{bytes, open, ranges};
 use super::{AppError, print};
-use crate::record::steps_in;
-use crate::record::{Damage, Flaw, Reader, Source, Step};
+use crate::control::rows::Row;
+use crate::record::{Damage, Flaw, Reader, Source, Step, steps_in};
 use crate::scenario::Scenario;
 use comfy_table::{CellAlignment, LineStyle, Table, TableStyle};
 use ipc_schemas::{self as frames, Assignment, VehicleCommand, VehicleState};
@@ -461,22 +461,12 @@ fn mode(command: &VehicleCommand) -> String {
 
 /// A command's verdict, with the rows that decided it.
 fn verdict(command: &VehicleCommand) -> String {
-    const ROWS: [&str; 8] = [
-        "u_min",
-        "u_max",
-        "v_min",
-        "v_max",
-        "rear end",
-        "rear-end feasibility",
-        "merge",
-        "merge feasibility",
-    ];
     match command.verdict {
         frames::VERDICT_NOMINAL => "as wished".to_owned(),
         frames::VERDICT_FE => "braking until the entry conditions hold".to_owned(),
         frames::VERDICT_BOUND => {
-            let rows = (0..).zip(ROWS).filter(|(bit, _)| command.binding_rows >> bit & 1 == 1);
-            format!("bound by {}", rows.map(|(_, name)| name).collect::<Vec<_>>().join(", "))
+            let rows = Row::ALL.into_iter().filter(|row| command.binding_rows & *row as u32 != 0);
+            format!("bound by {}", rows.map(Row::name).collect::<Vec<_>>().join(", "))
         }
         frames::VERDICT_INFEASIBLE => "infeasible: braking fully".to_owned(),
         frames::VERDICT_HELD => "held: no answer in time".to_owned(),

@@ -1,15 +1,14 @@
 //! The supervisor: starts the processes of a run, watches them, and leaves nothing behind.
 
 use super::AppError;
-use super::args::{Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs};
+use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs};
 use super::lines::{RefusedLine, SettledLine, WorldLine};
 use super::record::Recording;
 use super::run::Position;
 use crate::lockstep::RefusedFrames;
-use crate::process::{Observation, Outcome, ProcessError, Settled, WaitMode};
+use crate::process::{Observation, Outcome, ProcessError, Settled};
 use crate::scenario::Plugin;
 use crate::transport::iox::{RunName, RunSpace};
-use clap::ValueEnum;
 use crossbeam::channel::{Receiver, Sender, select, unbounded};
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
 use std::io::{BufRead, BufReader};
@@ -24,16 +23,11 @@ pub(super) struct Plan<'a> {
     pub run: RunName,
     pub scenario: &'a ScenarioArgs,
     pub share: ShareArgs,
-    pub wait: WaitArgs,
-    pub wait_mode: WaitMode,
     /// Controllers written elsewhere.
     pub plugins: &'a [Plugin],
     /// Number of processes of the built-in pool.
     pub pool: u32,
-    /// What becomes of the run when a participant dies.
-    pub restart: Restart,
-    /// When steps begin, and what becomes of late ones.
-    pub timing: TimingArgs,
+    pub conduct: ConductArgs,
     /// Id of the run.
     pub run_id: u64,
     /// The recording the run goes on from.
@@ -92,7 +86,7 @@ fn oversee(plan: &Plan<'_>, observed: bool, progress: impl FnMut(Position)) -> R
         children: Vec::new(),
         plugins: Vec::new(),
         events,
-        restart: plan.restart,
+        restart: plan.conduct.restart,
         due: Vec::new(),
         refused: Vec::new(),
     };
@@ -169,21 +163,13 @@ struct Member {
 
 impl Family {
     fn start(&mut self, plan: &Plan<'_>, observed: bool) -> Result<(), AppError> {
-        let timeout = |d: Duration| d.as_secs_f64().to_string();
-        let mut common: Vec<String> = ["--run", &plan.run.to_string()].map(str::to_owned).to_vec();
-        common.extend(["--attach-timeout".to_owned(), timeout(plan.wait.attach_timeout)]);
-        common.extend(["--peer-timeout".to_owned(), timeout(plan.wait.peer_timeout)]);
-        let name =
-            |v: Option<clap::builder::PossibleValue>| v.map_or_else(String::new, |v| v.get_name().to_owned());
-        common.extend(["--pin".to_owned(), name(plan.wait.pin.to_possible_value())]);
-        common.extend(plan.wait.rt.then(|| "--rt".to_owned()));
-        common.extend(["--supervised".to_owned(), std::process::id().to_string()]);
-        let mut world = common.clone();
+        let (run, supervisor) = (plan.run.to_string(), std::process::id().to_string());
+        let common = ["--run", &run, "--supervised", &supervisor].map(str::to_owned);
+        let participant = [&common[..], &plan.conduct.wait.to_flags()].concat();
+        let mut world = common.to_vec();
         world.extend(["--ctrl-procs".to_owned(), plan.share.ctrl_procs.to_string()]);
         world.extend(["--coord-procs".to_owned(), plan.share.coord_procs.to_string()]);
-        world.extend(["--wait".to_owned(), name(plan.wait_mode.to_possible_value())]);
-        world.extend(["--restart".to_owned(), name(plan.restart.to_possible_value())]);
-        world.extend(plan.timing.to_flags());
+        world.extend(plan.conduct.to_flags());
         world.extend(["--run-id".to_owned(), plan.run_id.to_string()]);
         world.extend(observed.then(|| "--observed".to_owned()));
         world.extend(plan.resume.map(|path| format!("--resume={}", path.display())));
@@ -193,7 +179,7 @@ impl Family {
             [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
         {
             for index in 0..count {
-                let mut arguments = common.clone();
+                let mut arguments = participant.clone();
                 arguments.extend(["--index".to_owned(), index.to_string()]);
                 self.spawn(Part { name: format!("{role} {index}"), command, arguments, restarts: 0 })?;
             }

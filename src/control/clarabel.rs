@@ -16,16 +16,16 @@ pub fn solve(tracking: &Tracking, rows: &[(Inequality, Row)]) -> Option<f64> {
     let a = CscMatrix::from(scaled.iter().map(|(row, _)| row));
     let b: Vec<f64> = scaled.iter().map(|&(_, bound)| bound).collect();
     let cones = [NonnegativeConeT(b.len())];
-    let mut last = f64::NAN;
+    let mut unsure = None;
     for max_step_fraction in STEP_FRACTIONS {
         let mut solver = DefaultSolver::new(&p, &[pull, 0.0], &a, &b, &cones, settings(max_step_fraction))
             .expect("dimensions agree: two variables, one bound per row");
         match answer(&mut solver, rows) {
             Ok(answer) => return answer,
-            Err(unsure) => last = unsure,
+            Err(end) => unsure = surer(unsure, end),
         }
     }
-    best_effort(last, rows)
+    unsure.map(|end| end.u)
 }
 
 /// A solver that is set up once and then only given new numbers.
@@ -99,17 +99,17 @@ impl Reused {
                 self.matrix[self.capacity + 1] = slack;
             }
         }
-        let mut last = f64::NAN;
+        let mut unsure = None;
         for solver in &mut self.solvers {
             solver
                 .update_data(&self.weights, &self.pull, &self.matrix, &self.bounds)
                 .expect("nothing was presolved and the numbers have the places of those before");
             match answer(solver, rows) {
                 Ok(answer) => return answer,
-                Err(unsure) => last = unsure,
+                Err(end) => unsure = surer(unsure, end),
             }
         }
-        best_effort(last, rows)
+        unsure.map(|end| end.u)
     }
 }
 
@@ -130,21 +130,42 @@ fn settings(max_step_fraction: f64) -> DefaultSettings<f64> {
     }
 }
 
-/// Solves, and says what comes of it; `Err` with the last iterate when that is no answer.
-fn answer(solver: &mut DefaultSolver<f64>, rows: &[(Inequality, Row)]) -> Result<Option<f64>, f64> {
+/// Where an attempt ended that is not sure of its answer.
+struct Unsure {
+    u: f64,
+    /// The greatest of the numbers by which the solver knows an optimum; 0 at one.
+    residual: f64,
+}
+
+/// Solves, and says what comes of it; `Err` when that is no answer, with the last iterate if the rows let it
+/// be one.
+fn answer(
+    solver: &mut DefaultSolver<f64>,
+    rows: &[(Inequality, Row)],
+) -> Result<Option<f64>, Option<Unsure>> {
     solver.solve();
-    let u = solver.solution.x[0];
-    match solver.solution.status {
+    let end = &solver.solution;
+    let u = end.x[0];
+    // A huge slack makes residuals, relative to the solution, small: the rows tell whether this is an answer.
+    let permitted = rows.iter().all(|(row, _)| satisfied(row, u));
+    match end.status {
         SolverStatus::PrimalInfeasible | SolverStatus::AlmostPrimalInfeasible => Ok(None),
-        SolverStatus::Solved => Ok(rows.iter().all(|(row, _)| satisfied(row, u)).then_some(u)),
+        SolverStatus::Solved => Ok(permitted.then_some(u)),
         // Not an answer, whatever it is near to.
-        _ => Err(u),
+        _ => {
+            let (value, dual) = (end.obj_val, end.obj_val_dual);
+            let gap = (value - dual).abs() / value.abs().min(dual.abs()).max(1.0);
+            Err(permitted.then_some(Unsure { u, residual: end.r_prim.max(end.r_dual).max(gap) }))
+        }
     }
 }
 
-/// A huge slack makes residuals, relative to the solution, small: the rows tell whether this is an answer.
-fn best_effort(last: f64, rows: &[(Inequality, Row)]) -> Option<f64> {
-    rows.iter().all(|(row, _)| satisfied(row, last)).then_some(last)
+/// The surer of two ends. An attempt that stalls next to the optimum may be followed by one that goes astray.
+fn surer(one: Option<Unsure>, other: Option<Unsure>) -> Option<Unsure> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(if other.residual < one.residual { other } else { one }),
+        (one, other) => one.or(other),
+    }
 }
 
 /// A program in units in which the solver keeps its digits: `min weight_of_u u^2 / 2 + e^2 / 2 + pull u`

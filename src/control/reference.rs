@@ -79,7 +79,8 @@ impl Problem {
     /// `equ:delta_t`).
     ///
     /// Corrected: first-order step `-(g_w / g_T) dw`, polished by Newton when the residual asks for it,
-    /// solved afresh (see [`solve_forward`](Self::solve_forward)) when the cost has two local minima. As printed: the printed first-order step alone.
+    /// solved afresh (see [`solve_forward`](Self::solve_forward)) when the cost has two local minima. As
+    /// printed: the printed first-order step alone.
     pub fn perturb(&self, law: ReferenceLaw, old: &Optimum, old_terminal: Terminal) -> Optimum {
         let (Terminal::Speed(w_old), Terminal::Speed(w)) = (old_terminal, self.terminal) else {
             return self.solve_forward(law);

@@ -90,9 +90,10 @@ impl Coordinator {
         self.receive(due);
     }
 
-    /// Acts on a state frame that holds at least the zones that act. Afterwards [`assignments`](Self::assignments) and
-    /// [`summaries`](Self::summaries) hold what is to be sent. Returns whether a zone of this process had
-    /// an event of its own, in which case every neighbouring process expects a summary frame.
+    /// Acts on a state frame that holds at least the zones that act. Afterwards
+    /// [`assignments`](Self::assignments) and [`summaries`](Self::summaries) hold what is to be sent. Returns
+    /// whether a zone of this process had an event of its own, in which case every neighbouring process
+    /// expects a summary frame.
     pub fn act(&mut self, step: u64, states: &[VehicleState]) -> bool {
         let mut had_event = false;
         if self.internal_step + 1 == step {

@@ -116,7 +116,7 @@ const AT_FIRST_NS: u64 = 1_000_000_000;
 /// Steps before the steady and event latencies are recorded: memory is mapped and caches fill.
 pub const WARM_UP_STEPS: u64 = 500;
 
-/// Measures steps and decides when to report progress.
+/// Measures how long steps take.
 #[derive(Debug)]
 pub(super) struct StepMeter {
     latency_ns: Histogram<u64>,

@@ -120,8 +120,8 @@ impl Pacer {
         self.timing.on_miss
     }
 
-    /// How long until a step is due, if it is not yet: sleep at most half of it, or, when it is short, ask
-    /// again at once.
+    /// How long may be slept before a step is due; nothing in the last stretch, in which the clock is to be
+    /// polled. `None` once it is due.
     pub fn until(&mut self, step: u64) -> Option<Duration> {
         if self.timing.pace == Pace::Free {
             return None;

@@ -38,11 +38,13 @@ impl Affinity {
     }
 }
 
-/// Pins the calling thread, and what it starts from then on, by its role; returns its core, or `None` when it was left where it is.
+/// Pins the calling thread, and what it starts from then on, by its role; returns its core, or `None` when it
+/// was left where it is.
 pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     if placement == Placement::None {
         return None;
     }
+    // Counted once and remembered: afterwards this process has but one.
     number_of_cores();
     let cores = cores();
     let core = match (role, &cores[..]) {

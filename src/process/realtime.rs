@@ -9,9 +9,7 @@ use super::placement::{cores, number_of_cores};
 use super::{Placement, WaitMode, place};
 use ipc_schemas::Role;
 use rustix::mm::{MlockAllFlags, mlockall};
-use rustix::process::{
-    Resource, Rlimit, getpriority_process, getrlimit, setpriority_process, setrlimit,
-};
+use rustix::process::{Resource, Rlimit, getpriority_process, getrlimit, setpriority_process, setrlimit};
 use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 use thread_priority::{
@@ -112,7 +110,8 @@ fn schedule(policy: NormalThreadSchedulePolicy) {
     // The library always sets niceness too, and makes 0 of 49 of 99: the way back from there is open to all but
     // who was not nice at all.
     let ordinary = ThreadPriority::Crossplatform(49.try_into().expect("priorities are below 100"));
-    let _ = set_thread_priority_and_policy(thread_native_id(), ordinary, ThreadSchedulePolicy::Normal(policy));
+    let _ =
+        set_thread_priority_and_policy(thread_native_id(), ordinary, ThreadSchedulePolicy::Normal(policy));
     if let Ok(niceness) = niceness {
         let _ = setpriority_process(None, niceness);
     }

@@ -47,9 +47,7 @@ impl WaitMode {
             WaitMode::Block => true,
         }
     }
-}
 
-impl WaitMode {
     /// Processes of a run that wait busily: world and controllers, or everybody.
     pub fn hot_processes(self, coordinators: u32, controllers: u32) -> usize {
         1 + controllers as usize + if self == WaitMode::Spin { coordinators as usize } else { 0 }
@@ -94,9 +92,7 @@ impl Patience {
             WaitMode::Spin => Patience { spin: Duration::MAX, busy: Duration::MAX, nap: NAP, timeout },
         }
     }
-}
 
-impl Patience {
     /// Whether spinning is followed by yielding: neither where it never ends nor under SCHED_FIFO.
     fn yields(&self) -> bool {
         self.spin < self.busy

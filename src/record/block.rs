@@ -145,9 +145,10 @@ impl BlockHead {
 }
 
 impl StepFrames<'_> {
-    fn head(&self) -> BlockHead {
+    /// The block's head but for its checksum and length.
+    fn unsealed_head(&self) -> BlockHead {
         let total = |lengths: &mut dyn Iterator<Item = usize>| lengths.sum::<usize>() as u32;
-        let mut head = BlockHead {
+        BlockHead {
             magic: BLOCK_MAGIC,
             length: 0,
             header: FrameHeader { record_count: self.state.len() as u32, ..self.header },
@@ -160,19 +161,19 @@ impl StepFrames<'_> {
             policy: self.policy,
             reserved: 0,
             check: 0,
-        };
-        head.seal();
-        head
+        }
     }
 
     /// Number of bytes of the block.
     pub fn encoded_len(&self) -> usize {
-        self.head().length as usize
+        self.unsealed_head().length_by_counts() as usize
     }
 
     /// Hands out the block's bytes piece by piece, in order.
     pub fn encode(&self, mut write: impl FnMut(&[u8])) {
-        write(self.head().as_bytes());
+        let mut head = self.unsealed_head();
+        head.seal();
+        write(head.as_bytes());
         for part in self.commands {
             let head = PartHead { generation: part.generation, records: part.records.len() as u32 };
             write(head.as_bytes());
@@ -181,22 +182,6 @@ impl StepFrames<'_> {
         self.summaries.iter().for_each(|s| write(bytes_of(s)));
         self.coordination.iter().for_each(|s| write(bytes_of(s)));
         self.commands.iter().for_each(|p| write(bytes_of(p.records)));
-    }
-
-    /// Writes the block into memory of [`encoded_len`](Self::encoded_len) bytes.
-    ///
-    /// # Panics
-    /// When the memory is of another length.
-    pub fn encode_into(&self, bytes: &mut [u8]) {
-        let mut rest = bytes;
-        self.encode(|piece| {
-            let (to, after) = std::mem::take(&mut rest)
-                .split_at_mut_checked(piece.len())
-                .expect("the memory for a block is as long as the block");
-            to.copy_from_slice(piece);
-            rest = after;
-        });
-        assert!(rest.is_empty(), "the memory for a block is as long as the block");
     }
 
     /// Appends the block to a buffer.

@@ -104,7 +104,7 @@ enum Message {
     End(RunEnd, Vec<(u64, u64)>),
 }
 
-/// Takes steps and never waits.
+/// Takes steps, and waits only where it is asked to.
 #[derive(Debug)]
 pub struct Recorder {
     queue: Sender<Message>,
@@ -116,6 +116,7 @@ pub struct Recorder {
     limits: QueueLimits,
     thread: JoinHandle<Result<Recorded, RecordError>>,
     next: u64,
+    /// Steps that could not be let in so far, and those that were never pushed between two that were.
     missing: Vec<(u64, u64)>,
 }
 
@@ -165,23 +166,11 @@ impl Recorder {
         sent
     }
 
-    /// Records a step; `false` when it could not be let in. Never waits.
-    pub fn push(&mut self, frames: &StepFrames<'_>) -> bool {
-        let mut block = self.buffer();
-        frames.encode_onto(&mut block);
-        self.enqueue(frames.header.step, block)
-    }
-
-    /// Records the block of a step that somebody else made.
+    /// Records the block of a step that somebody else made; `false` when it could not be let in. Never waits.
     pub fn push_block(&mut self, step: u64, bytes: &[u8]) -> bool {
         let mut block = self.buffer();
         block.extend_from_slice(bytes);
         self.enqueue(step, block)
-    }
-
-    /// Steps that could not be let in so far, and those that were never pushed between two that were.
-    pub fn missing(&self) -> &[(u64, u64)] {
-        &self.missing
     }
 
     /// Writes what waits, then the end. Waits for the disk.

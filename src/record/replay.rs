@@ -145,15 +145,18 @@ pub fn replay<S: Source>(reader: &Reader<S>, mut progress: impl FnMut(u64)) -> R
             }
         }
         // The others index by what a state frame says; one that no world sends ends them as well.
-        let sound = sound_states(reader.scenario(), &step.state);
-        let sound =
-            sound.and(if step.header.time_ns == steps.saturating_mul(dt_ns) { Ok(()) } else { Err(0) });
+        let flaw = if step.header.time_ns == steps.saturating_mul(dt_ns) {
+            flaw_of_states(reader.scenario(), &step.state)
+        } else {
+            Some(format!("step {steps} is recorded for another instant"))
+        };
         let is_last = step.header.flags & FLAG_END_OF_RUN != 0;
         for (role, tally) in &mut coordinators {
-            tally.step(sound, |_| if is_last { Ok(false) } else { role.take(&step, &before) });
+            tally.step(flaw.as_deref(), |_| if is_last { Ok(false) } else { role.take(&step, &before) });
         }
         for (role, tally) in &mut controllers {
-            tally.step(sound, |skipped| if is_last { Ok(false) } else { role.take(&step, skipped) });
+            tally
+                .step(flaw.as_deref(), |skipped| if is_last { Ok(false) } else { role.take(&step, skipped) });
         }
         before = step.summaries;
         steps += 1;
@@ -186,13 +189,13 @@ impl Tally {
     }
 
     /// Lets a role take a step unless it has gone astray; `Ok(true)` from it counts as compared.
-    fn step(&mut self, sound: Result<(), u32>, take: impl FnOnce(&mut u64) -> Result<bool, String>) {
+    fn step(&mut self, flaw: Option<&str>, take: impl FnOnce(&mut u64) -> Result<bool, String>) {
         if self.difference.is_some() {
             return;
         }
-        let taken = match sound {
-            Ok(()) => take(&mut self.skipped),
-            Err(vehicle) => Err(format!("the recorded state of vehicle {vehicle} is none a world sends")),
+        let taken = match flaw {
+            None => take(&mut self.skipped),
+            Some(flaw) => Err(flaw.to_owned()),
         };
         match taken {
             Ok(compared) => self.steps += u64::from(compared),
@@ -379,9 +382,9 @@ const MAX_M: f64 = 1e6;
 const MAX_MPS: f64 = 1e4;
 const MAX_S: f64 = 1e9;
 
-/// Whether a recorded state frame is one that roles can be given: zones in order, paths that exist, numbers
-/// that a vehicle can have; else the first vehicle of which it is not so.
-fn sound_states(scenario: &Scenario, states: &[VehicleState]) -> Result<(), u32> {
+/// Why a recorded state frame is none that roles can be given: zones out of order, a path that does not exist,
+/// numbers that no vehicle can have.
+fn flaw_of_states(scenario: &Scenario, states: &[VehicleState]) -> Option<String> {
     let mut last = 0;
     for (i, state) in states.iter().enumerate() {
         let is_first = i == 0 || states[i - 1].zone != state.zone;
@@ -398,9 +401,9 @@ fn sound_states(scenario: &Scenario, states: &[VehicleState]) -> Result<(), u32>
             && (is_first || state.flags & STATE_LEFT == 0)
             && numbers;
         if !sound {
-            return Err(state.vehicle);
+            return Some(format!("the recorded state of vehicle {} is none a world sends", state.vehicle));
         }
         last = state.zone;
     }
-    Ok(())
+    None
 }

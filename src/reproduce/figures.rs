@@ -8,6 +8,7 @@ use super::rate::{Curve, PERIODS};
 use super::statistics::Interval;
 use super::tables::SweepCurve;
 use plotters::coord::Shift;
+use plotters::coord::types::RangedCoordf64;
 use plotters::element::DashedPathElement;
 use plotters::prelude::*;
 use plotters::style::register_font;
@@ -16,6 +17,8 @@ use std::sync::Once;
 
 /// Size of every figure, pixels.
 const SIZE: (u32, u32) = (900, 560);
+const AXIS_FONT: (&str, u32) = ("sans-serif", 16);
+const LABEL_FONT: (&str, u32) = ("sans-serif", 14);
 const BLUE: RGBColor = RGBColor(31, 119, 180);
 const ORANGE: RGBColor = RGBColor(255, 127, 14);
 const GREEN: RGBColor = RGBColor(44, 160, 44);
@@ -74,17 +77,7 @@ fn draw_sweep<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, curve: &SweepCur
         .x_label_area_size(48)
         .y_label_area_size(64)
         .build_cartesian_2d(from - 0.25..to + 0.25, low..high)?;
-    chart
-        .configure_mesh()
-        .x_desc("terminal speed of CZ1, v_m1 (m/s)")
-        .y_desc("mean objective per vehicle (m²/s³)")
-        .x_labels(9)
-        .x_label_formatter(&|v| format!("{v:.0}"))
-        .y_label_formatter(&|v| format!("{v:.0}"))
-        .axis_desc_style(("sans-serif", 16))
-        .label_style(("sans-serif", 14))
-        .light_line_style(WHITE)
-        .draw()?;
+    axes(&mut chart, ("terminal speed of CZ1, v_m1 (m/s)", 9), "mean objective per vehicle (m²/s³)")?;
     for ((name, color), (values, baseline)) in [("CZ1", BLUE), ("CZ2", ORANGE), ("total", GREEN)]
         .into_iter()
         .zip(curve.objectives.iter().zip(&curve.baseline))
@@ -101,7 +94,7 @@ fn draw_sweep<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, curve: &SweepCur
         chart
             .draw_series(LineSeries::new(means.clone(), color.stroke_width(2)))?
             .label(format!("{name}, fixed v_m1 (mean, 95 % band)"))
-            .legend(move |(x, y)| PathElement::new([(x, y), (x + 24, y)], color.stroke_width(2)));
+            .legend(move |(x, y)| solid(x, y, color.stroke_width(2)));
         chart.draw_series(means.map(|p| Circle::new(p, 3, color.filled())))?;
         if let Some(b) = baseline {
             let line = [(from, b.mean), (to, b.mean)];
@@ -121,17 +114,10 @@ fn draw_sweep<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, curve: &SweepCur
         chart
             .draw_series(LineSeries::new(line, BLACK.stroke_width(1)))?
             .label(label)
-            .legend(|(x, y)| PathElement::new([(x, y), (x + 24, y)], BLACK.stroke_width(1)));
+            .legend(|(x, y)| solid(x, y, BLACK.stroke_width(1)));
         chart.draw_series(minimum.map(|v| TriangleMarker::new((v, fit.value(v)), 7, BLACK.filled())))?;
     }
-    chart
-        .configure_series_labels()
-        .position(SeriesLabelPosition::UpperRight)
-        .legend_area_size(30)
-        .background_style(WHITE.mix(0.85))
-        .border_style(GREY)
-        .label_font(("sans-serif", 13))
-        .draw()?;
+    legend(&mut chart, SeriesLabelPosition::UpperRight)?;
     area.present()
 }
 
@@ -149,22 +135,13 @@ fn draw_rate<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, title: &str, curv
         .right_y_label_area_size(64)
         .build_cartesian_2d(0.0..end, low - 0.1 * (high - low)..high + 0.45 * (high - low))?
         .set_secondary_coord(0.0..end, 0.0..700.0);
-    chart
-        .configure_mesh()
-        .x_desc("instant of entry (s)")
-        .y_desc("objective over both zones (m²/s³), smoothed")
-        .x_label_formatter(&|v| format!("{v:.0}"))
-        .y_label_formatter(&|v| format!("{v:.0}"))
-        .axis_desc_style(("sans-serif", 16))
-        .label_style(("sans-serif", 14))
-        .light_line_style(WHITE)
-        .draw()?;
+    axes(&mut chart, ("instant of entry (s)", 11), "objective over both zones (m²/s³), smoothed")?;
     chart
         .configure_secondary_axes()
         .y_desc("traffic rate (veh/h and road)")
         .y_label_formatter(&|v| format!("{v:.0}"))
-        .axis_desc_style(("sans-serif", 16))
-        .label_style(("sans-serif", 14))
+        .axis_desc_style(AXIS_FONT)
+        .label_style(LABEL_FONT)
         .draw()?;
     // Behind the curves, as in the paper.
     let mut steps = Vec::new();
@@ -190,19 +167,53 @@ fn draw_rate<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, title: &str, curv
                 chart
                     .draw_series(LineSeries::new(points, color.stroke_width(2)))?
                     .label(label)
-                    .legend(move |(x, y)| PathElement::new([(x, y), (x + 24, y)], color.stroke_width(2)))
+                    .legend(move |(x, y)| solid(x, y, color.stroke_width(2)))
             }
         };
     }
+    legend(&mut chart, SeriesLabelPosition::UpperLeft)?;
+    area.present()
+}
+
+type Plane = Cartesian2d<RangedCoordf64, RangedCoordf64>;
+
+/// Draws the axes, with whole numbers at about `x_labels` places of the lower one.
+fn axes<DB: DrawingBackend>(
+    chart: &mut ChartContext<'_, DB, Plane>,
+    (x, x_labels): (&str, usize),
+    y: &str,
+) -> Drawn<DB> {
+    chart
+        .configure_mesh()
+        .x_desc(x)
+        .y_desc(y)
+        .x_labels(x_labels)
+        .x_label_formatter(&|v| format!("{v:.0}"))
+        .y_label_formatter(&|v| format!("{v:.0}"))
+        .axis_desc_style(AXIS_FONT)
+        .label_style(LABEL_FONT)
+        .light_line_style(WHITE)
+        .draw()
+}
+
+/// Draws what the series are called.
+fn legend<'a, DB: DrawingBackend + 'a>(
+    chart: &mut ChartContext<'a, DB, Plane>,
+    position: SeriesLabelPosition,
+) -> Drawn<DB> {
     chart
         .configure_series_labels()
-        .position(SeriesLabelPosition::UpperLeft)
+        .position(position)
         .legend_area_size(30)
         .background_style(WHITE.mix(0.85))
         .border_style(GREY)
         .label_font(("sans-serif", 13))
-        .draw()?;
-    area.present()
+        .draw()
+}
+
+/// A solid sample for the legend.
+fn solid(x: i32, y: i32, style: ShapeStyle) -> PathElement<(i32, i32)> {
+    PathElement::new([(x, y), (x + 24, y)], style)
 }
 
 /// A dashed sample for the legend.

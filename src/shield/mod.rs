@@ -3,9 +3,9 @@
 //! Pure functions of the present state and of what the partners will do in this step. A state is safe
 //! toward a leader when the margin `x_p - x - phi v - delta` stays non-negative if both brake at `u_min`
 //! to a stop; toward a merging partner when, both braking, the vehicle stops before the conflict point or
-//! is safe toward it, as toward a leader, once it gets there. Both sets are closed forms, both are invariant under `u_min`, and in both the set of
-//! admissible accelerations of a step is an interval that begins at `u_min`. So the projection always
-//! exists, and it is one number. The derivation is in `docs/shield.md`.
+//! is safe toward it, as toward a leader, once it gets there. Both sets are closed forms, both are invariant
+//! under `u_min`, and in both the set of admissible accelerations of a step is an interval that begins at
+//! `u_min`. So the projection always exists, and it is one number. The derivation is in `docs/shield.md`.
 
 use crate::scenario::VehicleParams;
 use crate::vehicle::Held;
@@ -55,10 +55,10 @@ pub struct Projection {
 /// Slack below which the shield leaves a vehicle no choice but `u_min`, m. Braking at `u_min` keeps the
 /// slack constant but for rounding (some 1e-14 m a step), so this absorbs 10^4 steps of it.
 pub const RESERVE_M: f64 = 1e-9;
+/// What a speed may exceed the greatest one by, m/s: rounding.
+const RESERVE_MPS: f64 = 1e-9;
 /// Crossing speeds are taken to be at least this, m/s.
 const LEAST_CROSSING_MPS: f64 = 1e-3;
-/// The same for the greatest speed, m/s.
-const RESERVE_MPS: f64 = 1e-9;
 /// Halvings of the bracket `[u_min, wish]`: to the last bits of a double.
 const HALVINGS: u32 = 52;
 

@@ -16,6 +16,19 @@ use tempfile::TempDir;
 /// Longer than anything here takes on a loaded machine; shorter than anybody's patience.
 pub const LONG: Duration = Duration::from_secs(60);
 
+/// Steady traffic through two zones for 100 000 steps: a run long enough to be disturbed in the middle of.
+pub const LONG_RUN: [&str; 9] = [
+    "varying-demand",
+    "--set",
+    "end.time_s=10000",
+    "--set",
+    "roads.main1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge1.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge2.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
+];
+
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
 /// A run name nobody else uses: /dev/shm is shared with all other tests.
@@ -274,4 +287,23 @@ pub fn children(process_id: u32) -> Vec<(u32, Vec<String>)> {
             (id, line.split('\0').map(str::to_owned).collect())
         })
         .collect()
+}
+
+/// Starts `cz run` and waits until it has started that many parts; returns their names and process ids.
+pub fn begin(site: &Site, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
+    let supervisor = site.start("cz", arguments);
+    let mut parts = Vec::new();
+    wait_until("the supervisor to have started the parts", || {
+        parts = children(supervisor.id())
+            .into_iter()
+            .filter_map(|(id, line)| line.get(1).filter(|part| *part != "run").map(|p| (p.clone(), id)))
+            .collect();
+        parts.len() == processes
+    });
+    (supervisor, parts)
+}
+
+/// The process id of the first part of that name.
+pub fn part(parts: &[(String, u32)], name: &str) -> u32 {
+    parts.iter().find(|(part, _)| part == name).unwrap_or_else(|| panic!("no {name} in {parts:?}")).1
 }

@@ -162,7 +162,9 @@ fn read_run(all: &[u8], index: u32) -> Result<Run, Error> {
         .zip(text.lines())
         .map(|(spec, name)| Approach { spec, name: name.to_owned() })
         .collect();
-    if approaches.len() != spec.approaches as usize {
+    // Whoever has an approach is looked up by zone.
+    let zones_exist = approaches.iter().all(|a| a.spec.zone < spec.zones) && spec.zones <= spec.approaches;
+    if approaches.len() != spec.approaches as usize || !zones_exist {
         return Err(bad());
     }
     Ok(Run { spec, approaches, index })
