@@ -80,7 +80,7 @@ pub const EQUATIONS: [Mapping; 37] = [
     map(
         "equ:ucp_vm_5",
         "transversality, β − ½b² + ac = 0 (misprinted)",
-        &[("control/reference.rs", "quartic"), ("reproduce/errata.rs", "lost_square")],
+        &[("control/reference.rs", "quartic"), ("reproduce/errata/equations.rs", "lost_square")],
     ),
     map(
         "equ:cbf",
@@ -135,18 +135,18 @@ pub const EQUATIONS: [Mapping; 37] = [
         &[
             ("control/reference.rs", "printed_duration"),
             ("control/reference.rs", "quartic"),
-            ("reproduce/errata.rs", "cubic"),
+            ("reproduce/errata/equations.rs", "cubic"),
         ],
     ),
     map(
         "equ:perturb_tm",
         "first-order change of the duration",
-        &[("control/reference.rs", "perturb"), ("reproduce/errata.rs", "derivative_display")],
+        &[("control/reference.rs", "perturb"), ("reproduce/errata/equations.rs", "derivative_display")],
     ),
     map(
         "equ:delta_t",
         "ΔT for a change of terminal speed",
-        &[("control/reference.rs", "perturb"), ("reproduce/errata.rs", "delta_t")],
+        &[("control/reference.rs", "perturb"), ("reproduce/errata/equations.rs", "delta_t")],
     ),
     map("equ:ucp_vm_tm", "coefficients for a given duration", &[("control/reference.rs", "coefficients")]),
     map(
