@@ -11,6 +11,7 @@ use ipc_schemas::{
     ANY_INDEX, ATTACH_BAD_PHASE, ATTACH_JOIN, ATTACH_NO_CONTROLLER, ATTACH_NO_ROOM, ATTACH_READY, Assignment,
     AttachRequest, FrameHeader, Role, SERVICE_COMMAND, SERVICE_COORDINATION, VehicleCommand, schema_hash,
 };
+use rustix::process::Signal;
 use std::process::{Child, Command, Stdio};
 
 /// Frames the hostile process sends; the run lasts until all are.
@@ -99,11 +100,11 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
             }
             if !stopped && sent > 1000 {
                 // Stepping in spite of the flood so far; from now on the world waits for its controller.
-                common::send(controller.id(), rustix::process::Signal::STOP);
+                common::send(controller.id(), Signal::STOP);
                 stopped = true;
             }
         }
-        common::send(controller.id(), rustix::process::Signal::CONT);
+        common::send(controller.id(), Signal::CONT);
     }
     let output = world.wait_with_output().unwrap();
     assert!(output.status.success(), "{output:?}");
@@ -122,8 +123,9 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
     println!("{counted} frames refused, of {} kinds of sender, e.g. {:?}", refused.len(), kinds.first());
 }
 
-/// Sends assignments of another run to whoever listens, until the process has ended.
-fn mislead(name: &str, until: &mut Child) {
+/// Lets a run go on once it is there to be misled, then sends assignments of another run to whoever listens,
+/// until the process has ended.
+fn mislead(name: &str, go_on: impl FnOnce(), until: &mut Child) {
     let run: RunName = name.parse().unwrap();
     let space = RunSpace::enter(&run).unwrap();
     let mut service = None;
@@ -132,6 +134,7 @@ fn mislead(name: &str, until: &mut Child) {
         service.is_some()
     });
     let mut outbox = service.unwrap().outbox(1).unwrap();
+    go_on();
     let header = FrameHeader {
         run_id: !RUN_ID,
         schema_hash: schema_hash(),
@@ -140,13 +143,13 @@ fn mislead(name: &str, until: &mut Child) {
     };
     while until.try_wait().unwrap().is_none() {
         outbox.loan(header, 0, |_| {}).unwrap().send().unwrap();
-        std::thread::sleep(std::time::Duration::from_micros(200));
+        std::thread::sleep(std::time::Duration::from_micros(100));
     }
 }
 
 #[test]
 fn what_a_controller_refuses_is_in_the_summary_and_by_hand_on_stderr() {
-    const LONG: [&str; 3] = ["--set", "end.time_s=600", "varying-demand"];
+    const LONG: [&str; 3] = ["--set", "end.time_s=2000", "varying-demand"];
     let start = |program: &str, arguments: &[&str]| {
         let mut command = Command::new(program);
         command.args(arguments).stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
@@ -154,9 +157,19 @@ fn what_a_controller_refuses_is_in_the_summary_and_by_hand_on_stderr() {
     };
     let own = format!("coordinator 0 (process {})", std::process::id());
     let name = unique_name("mislead");
-    let mut supervisor =
-        start(env!("CARGO_BIN_EXE_cz"), &[&["run", "--run", &name, "--json", "-"], &LONG[..]].concat());
-    mislead(&name, &mut supervisor);
+    let arguments = [&["run", "--run", &name, "--json", "-"], &LONG[..]].concat();
+    let mut supervisor = start(env!("CARGO_BIN_EXE_cz"), &arguments);
+    // Held, so that the run does not end before anybody misleads it.
+    let mut controller = None;
+    wait_until("the controller", || {
+        let parts = common::children(supervisor.id());
+        controller =
+            parts.iter().find(|(_, line)| line.get(1).is_some_and(|p| p == "ctrl")).map(|(id, _)| *id);
+        controller.is_some()
+    });
+    let controller = controller.unwrap();
+    common::send(controller, Signal::STOP);
+    mislead(&name, || common::send(controller, Signal::CONT), &mut supervisor);
     let output = supervisor.wait_with_output().unwrap();
     assert!(output.status.success(), "{output:?}");
     let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -170,10 +183,12 @@ fn what_a_controller_refuses_is_in_the_summary_and_by_hand_on_stderr() {
 
     let name = unique_name("mislead");
     let mut world = start(env!("CARGO_BIN_EXE_cz-world"), &[&["--run", &name], &LONG[..]].concat());
-    let parts =
-        [env!("CARGO_BIN_EXE_cz-coord"), env!("CARGO_BIN_EXE_cz-ctrl")].map(|p| start(p, &["--run", &name]));
-    mislead(&name, &mut world);
-    let [coordinator, controller] = parts.map(|part| part.wait_with_output().unwrap());
+    let coordinator = start(env!("CARGO_BIN_EXE_cz-coord"), &["--run", &name]);
+    let mut controller = None;
+    let go_on = || controller = Some(start(env!("CARGO_BIN_EXE_cz-ctrl"), &["--run", &name]));
+    mislead(&name, go_on, &mut world);
+    let [coordinator, controller] =
+        [coordinator, controller.unwrap()].map(|part| part.wait_with_output().unwrap());
     assert!(coordinator.status.success() && coordinator.stderr.is_empty(), "{coordinator:?}");
     let said = String::from_utf8(controller.stderr).unwrap();
     assert!(said.starts_with("controller 0 refused ") && said.contains(&own), "{said}");
