@@ -282,6 +282,11 @@ pub(super) struct WaitArgs {
 }
 
 impl WaitArgs {
+    /// Whether anything is asked of the system of which it is worth saying what was granted.
+    pub fn asks_for_placement(&self) -> bool {
+        self.rt || self.pin != Placement::None
+    }
+
     /// As a process of the run is given them.
     pub fn to_flags(self) -> Vec<String> {
         let seconds = |d: Duration| d.as_secs_f64().to_string();

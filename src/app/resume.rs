@@ -29,6 +29,7 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
     let reader = record::open(&args.file)?;
     let scenario = reader.scenario().clone();
     let first = first_missing_step(&reader);
+    args.conduct.timing.timing()?;
     let last = reader.steps().map_while(Result::ok).last();
     if last.is_some_and(|step| step.header.flags & ipc_schemas::FLAG_END_OF_RUN != 0) {
         let problem = format!("{}: the run is complete; nothing is left to be resumed", args.file.display());
@@ -47,7 +48,6 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         run_id: new_run_id(),
         resume: Some(&args.file),
     };
-    args.conduct.timing.timing()?;
     let recording = match &args.record {
         Some(path) => Some(Recording::continuation(path, &reader, &args.file, first, plan.run_id)?),
         None => None,
@@ -57,7 +57,9 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
     bar.finish();
     let recorded = recording.map_or(Ok(()), |recording| recording.finish(&outcome));
     let processes = 1 + share.coord_procs + scenario.controllers(share.ctrl_procs);
-    Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome?).deliver(args.json.as_deref())?;
+    let asked = args.conduct.wait.asks_for_placement();
+    let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome?);
+    summary.with_placement(asked).deliver(args.json.as_deref())?;
     recorded
 }
 

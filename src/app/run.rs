@@ -6,9 +6,7 @@ use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
 use super::{AppError, controllers};
 use crate::lockstep::in_process::InProcess;
-use crate::process::{
-    Placement, StopFlag, WaitMode, check_cores, new_run_id, run_in_process, run_in_process_observed,
-};
+use crate::process::{StopFlag, WaitMode, check_cores, new_run_id, run_in_process, run_in_process_observed};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::World;
@@ -82,7 +80,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         (Transport::Iceoryx2 { processes }, outcome)
     };
     bar.finish();
-    let asked = args.conduct.wait.rt || args.conduct.wait.pin != Placement::None;
+    let asked = args.conduct.wait.asks_for_placement();
     Summary::new(&scenario, transport, outcome?).with_placement(asked).deliver(args.json.as_deref())?;
     // A recording that failed does not take the results with it.
     recorded
