@@ -1,0 +1,69 @@
+//! Arguments of `cz bench`.
+
+use super::ScenarioArgs;
+use crate::scenario::{Scenario, ScenarioError};
+use clap::{Args, Subcommand};
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct BenchArgs {
+    #[command(subcommand)]
+    pub kind: BenchKind,
+}
+
+#[derive(Debug, Subcommand)]
+pub(in crate::app) enum BenchKind {
+    /// One step, next to the machine's floor and to what one would write instead.
+    Latency(MeasureArgs),
+    /// The closed-form QP next to Clarabel, and the whole controller.
+    Solver(MeasureArgs),
+    /// Step time from a hundred to a hundred thousand vehicles.
+    Scale(ScaleArgs),
+    /// The other process of a measurement.
+    #[command(hide = true)]
+    Peer(PeerArgs),
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct MeasureArgs {
+    /// Fewer repetitions, smaller sizes: a check that it works rather than a measurement.
+    #[arg(long)]
+    pub quick: bool,
+    /// Also write the results as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct ScaleArgs {
+    #[command(flatten)]
+    pub measure: MeasureArgs,
+    /// Also measure SUMO's stepping, with its human drivers on the same corridors. Needs the Python package
+    /// eclipse-sumo in the Python that CZ_PYTHON names (default: python3).
+    #[arg(long)]
+    pub with_sumo: bool,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct PeerArgs {
+    #[command(flatten)]
+    pub scenario: PeerScenarioArgs,
+    pub kind: String,
+    pub values: Vec<String>,
+}
+
+/// The scenario of a measurement's other process: always the default one, changed.
+#[derive(Debug, Args)]
+pub(in crate::app) struct PeerScenarioArgs {
+    #[arg(long)]
+    pub seed: Option<u64>,
+    #[arg(long = "set")]
+    pub set: Vec<String>,
+}
+
+impl PeerScenarioArgs {
+    pub fn load(&self) -> Result<Scenario, ScenarioError> {
+        let (seed, set) = (self.seed, self.set.clone());
+        ScenarioArgs { scenario: None, seed, set, corridors: None }.load()
+    }
+}

@@ -1,0 +1,136 @@
+//! Command-line arguments.
+
+mod bench;
+mod conduct;
+mod record;
+mod run;
+mod scenario;
+
+use crate::reproduce::cli::ReproduceArgs;
+pub(super) use bench::{BenchArgs, BenchKind, PeerArgs};
+use clap::{Args, Parser, Subcommand};
+pub(super) use conduct::{ConductArgs, Restart, ShareArgs, TimingArgs, WaitArgs};
+pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
+pub(super) use run::{PartArgs, RunArgs, WorldArgs};
+pub(super) use scenario::ScenarioArgs;
+use std::path::PathBuf;
+
+/// Safe, optimal coordination of connected automated vehicles through networks of control zones.
+///
+/// `cz run` runs the embedded two-zone merging experiment as three processes that exchange frames
+/// through shared memory, and prints a table of results.
+#[derive(Debug, Parser)]
+#[command(name = "cz", version, propagate_version = true)]
+pub(super) struct Cz {
+    #[command(subcommand)]
+    pub command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum Command {
+    /// Run a scenario: start all processes, show progress, print the results.
+    Run(RunArgs),
+    /// Start only the world of a run (the same as the program cz-world).
+    World(WorldArgs),
+    /// Start only a coordinator of a run (the same as the program cz-coord).
+    Coord(PartArgs),
+    /// Start only a controller of a run (the same as the program cz-ctrl).
+    Ctrl(PartArgs),
+    /// Compute one reference trajectory: duration, coefficients, cost.
+    Plan(PlanArgs),
+    /// Show a recording: what it is of, one of its steps, or a vehicle's course.
+    Show(ShowArgs),
+    /// Compare two recordings: the first step, vehicle and field in which they differ.
+    Verify(VerifyArgs),
+    /// Run every role of a recording again from its recorded inputs and compare.
+    Replay(ReplayArgs),
+    /// Go on with an interrupted run from its recording, to the same result.
+    Resume(ResumeArgs),
+    /// Run a recorded run's future from a step on with other settings, beside the one it had.
+    Branch(BranchArgs),
+    /// Regenerate the paper's tables and figures with intervals, verdicts and errata.
+    Reproduce(ReproduceArgs),
+    /// Measure latency, the solver, or scale on this machine.
+    Bench(BenchArgs),
+    /// Remove the shared memory and files that crashed runs of yours have left; active runs are not touched.
+    Clean(CleanArgs),
+    /// Controllers of your own: check one against the contract, or numbers against the law.
+    Plugin {
+        #[command(subcommand)]
+        command: PluginCommand,
+    },
+    /// What controllers in C and C++ are built against.
+    Sdk {
+        #[command(subcommand)]
+        command: SdkCommand,
+    },
+}
+
+#[derive(Debug, Args)]
+pub(super) struct CleanArgs {
+    /// Only say what would be removed.
+    #[arg(long)]
+    pub dry_run: bool,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum PluginCommand {
+    /// Start a controller against a scripted world and report, rule by rule, whether it keeps the contract.
+    Check {
+        /// Time within which each step is to be answered, ms.
+        #[arg(long, value_name = "MS", default_value_t = 100.0)]
+        deadline_ms: f64,
+        /// Print JSON.
+        #[arg(long)]
+        json: bool,
+        /// The controller's command line, after `--`.
+        #[arg(last = true, required = true, value_name = "COMMAND")]
+        command: Vec<String>,
+    },
+    /// Print test vectors of the paper's law as JSON: trajectories, rows and commands.
+    Golden,
+}
+
+#[derive(Debug, Subcommand)]
+pub(super) enum SdkCommand {
+    /// Install headers, libraries, and files for pkg-config and CMake.
+    Install {
+        /// Directory to install under.
+        #[arg(long, value_name = "DIR")]
+        prefix: PathBuf,
+    },
+}
+
+/// A program of its own around the arguments of a subcommand.
+#[derive(Debug, Parser)]
+#[command(version)]
+pub(super) struct Standalone<A: Args> {
+    #[command(flatten)]
+    pub args: A,
+}
+
+#[derive(Debug, Args)]
+#[command(group = clap::ArgGroup::new("terminal").required(true))]
+pub(super) struct PlanArgs {
+    /// Entry speed, m/s.
+    #[arg(long, value_name = "M_PER_S")]
+    pub v0: f64,
+    /// Length of the approach, m.
+    #[arg(long, value_name = "M")]
+    pub length: f64,
+    /// Weight of time against energy, m^2/s^4.
+    #[arg(long, value_name = "BETA")]
+    pub beta: f64,
+    /// Terminal speed v_m, m/s.
+    #[arg(long, value_name = "M_PER_S", group = "terminal")]
+    pub vm: Option<f64>,
+    /// Leave the terminal speed free.
+    #[arg(long, group = "terminal")]
+    pub free: bool,
+    /// Use the transversality condition as the paper prints it.
+    #[arg(long)]
+    pub as_printed: bool,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}

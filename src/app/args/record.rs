@@ -1,0 +1,77 @@
+//! Arguments of what works on recordings.
+
+use super::ConductArgs;
+use crate::transport::iox::RunName;
+use clap::Args;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct ShowArgs {
+    /// The recording.
+    pub file: PathBuf,
+    /// Show one step: states, assignments and commands.
+    #[arg(long, value_name = "K", conflicts_with = "vehicle")]
+    pub step: Option<u64>,
+    /// Show the course of one vehicle.
+    #[arg(long, value_name = "ID")]
+    pub vehicle: Option<u32>,
+    /// Print the scenario's text and what was changed in it.
+    #[arg(long, conflicts_with_all = ["step", "vehicle", "json"])]
+    pub scenario: bool,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct VerifyArgs {
+    /// One recording.
+    pub first: PathBuf,
+    /// The other.
+    pub second: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct ReplayArgs {
+    /// The recording.
+    pub file: PathBuf,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct ResumeArgs {
+    /// The recording; it decides the scenario and the numbers of processes.
+    pub file: PathBuf,
+    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+    /// Record the run in this file, its past included: a recording of the whole run. Not the file it goes on
+    /// from; an older recording is replaced.
+    #[arg(long, value_name = "FILE")]
+    pub record: Option<PathBuf>,
+    /// Name of the run; runs of different names do not see each other [default: one of its own].
+    #[arg(long, value_name = "NAME")]
+    pub run: Option<RunName>,
+    #[command(flatten)]
+    pub conduct: ConductArgs,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct BranchArgs {
+    /// The recording.
+    pub file: PathBuf,
+    /// The first step of the other future.
+    #[arg(long, value_name = "STEP")]
+    pub at: u64,
+    /// Change a scenario key from then on, e.g. `--set zones.merge-1.flow.gain_mps=0.3`; may be repeated.
+    #[arg(long = "set", value_name = "KEY=VALUE", required = true)]
+    pub set: Vec<String>,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+}

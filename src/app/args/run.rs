@@ -1,0 +1,84 @@
+//! Arguments of what runs a scenario, or a part of it.
+
+use super::{ConductArgs, ScenarioArgs, ShareArgs, WaitArgs};
+use crate::transport::iox::RunName;
+use clap::Args;
+use std::path::PathBuf;
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct RunArgs {
+    #[command(flatten)]
+    pub scenario: ScenarioArgs,
+    /// Run everything in this process, without shared memory.
+    #[arg(long, conflicts_with = "rt")]
+    pub in_process: bool,
+    #[command(flatten)]
+    pub share: ShareArgs,
+    /// Let a program of your own drive zones or approaches, e.g. `--controller merge-2="python3 mine.py"`;
+    /// may be repeated. TARGET is a list such as `merge-1,merge-2.main`, or the name of a controller that
+    /// the scenario declares.
+    #[arg(long = "controller", value_name = "TARGET=COMMAND")]
+    pub controllers: Vec<String>,
+    /// What becomes of commands that are not safe, in place of the scenario's `shield`: off, observe, on.
+    #[arg(long, value_name = "MODE")]
+    pub shield: Option<String>,
+    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+    /// Record every frame of the run in this file (.czlog); an older recording is replaced.
+    #[arg(long, value_name = "FILE")]
+    pub record: Option<PathBuf>,
+    /// Name of the run; runs of different names do not see each other [default: one of its own].
+    #[arg(long, value_name = "NAME")]
+    pub run: Option<RunName>,
+    #[command(flatten)]
+    pub conduct: ConductArgs,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct WorldArgs {
+    /// Name of the run; the other parts are started with the same name.
+    #[arg(long, value_name = "NAME")]
+    pub run: RunName,
+    #[command(flatten)]
+    pub scenario: ScenarioArgs,
+    #[command(flatten)]
+    pub share: ShareArgs,
+    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
+    #[command(flatten)]
+    pub conduct: ConductArgs,
+    /// Record every frame of the run in this file (.czlog); an older recording is replaced.
+    #[arg(long, value_name = "FILE")]
+    pub record: Option<PathBuf>,
+    /// Begin only once somebody looks on.
+    #[arg(long, hide = true)]
+    pub observed: bool,
+    /// The run's id.
+    #[arg(long, hide = true, value_name = "ID")]
+    pub run_id: Option<u64>,
+    /// Go on from this recording, which decides the scenario and the numbers of processes.
+    #[arg(long, hide = true, value_name = "FILE")]
+    pub resume: Option<PathBuf>,
+    /// Process id of the supervisor: report to it on stdout, and end with it.
+    #[arg(long, hide = true, value_name = "PID")]
+    pub supervised: Option<u32>,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct PartArgs {
+    /// Name of the run to join.
+    #[arg(long, value_name = "NAME")]
+    pub run: RunName,
+    /// Index among the processes of the same role [default: the first free one].
+    #[arg(long, value_name = "I")]
+    pub index: Option<u16>,
+    #[command(flatten)]
+    pub scenario: ScenarioArgs,
+    #[command(flatten)]
+    pub wait: WaitArgs,
+    /// Process id of the supervisor: end with it.
+    #[arg(long, hide = true, value_name = "PID")]
+    pub supervised: Option<u32>,
+}
