@@ -11,6 +11,7 @@ use crate::scenario::Plugin;
 use crate::transport::iox::{RunName, RunSpace};
 use crossbeam::channel::{Receiver, Sender, select, unbounded};
 use rustix::process::{Pid, Signal, kill_process, kill_process_group};
+use std::ffi::OsString;
 use std::io::{BufRead, BufReader};
 use std::os::unix::process::{CommandExt, ExitStatusExt};
 use std::path::Path;
@@ -143,7 +144,7 @@ struct Family {
 struct Part {
     name: String,
     command: &'static str,
-    arguments: Vec<String>,
+    arguments: Vec<OsString>,
     /// Restarts in a row.
     restarts: u32,
 }
@@ -172,15 +173,21 @@ impl Family {
         world.extend(plan.conduct.to_flags());
         world.extend(["--run-id".to_owned(), plan.run_id.to_string()]);
         world.extend(observed.then(|| "--observed".to_owned()));
-        world.extend(plan.resume.map(|path| format!("--resume={}", path.display())));
         world.extend(plan.scenario.to_arguments());
-        self.spawn(Part { name: "world".to_owned(), command: "world", arguments: world, restarts: 0 })?;
+        let resume = plan.resume.map(|path| {
+            let mut argument = OsString::from("--resume=");
+            argument.push(path);
+            argument
+        });
+        let arguments = resume.into_iter().chain(world.into_iter().map(OsString::from)).collect();
+        self.spawn(Part { name: "world".to_owned(), command: "world", arguments, restarts: 0 })?;
         for (role, command, count) in
             [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
         {
             for index in 0..count {
                 let mut arguments = participant.clone();
                 arguments.extend(["--index".to_owned(), index.to_string()]);
+                let arguments = arguments.into_iter().map(OsString::from).collect();
                 self.spawn(Part { name: format!("{role} {index}"), command, arguments, restarts: 0 })?;
             }
         }
