@@ -107,7 +107,6 @@ where
         }
         match self.pending.take() {
             None => self.take_state(),
-            Some((state, 0)) => self.act(&state),
             Some((state, missing)) => self.take_summaries(state, missing),
         }
     }
@@ -144,6 +143,8 @@ where
         Ok(Progress::Advanced)
     }
 
+    /// Takes one summary, or acts when none is missing and none is left. What came twice is taken too: left
+    /// alone, it would soon fill the inbox, and the next summary find no room.
     fn take_summaries(
         &mut self,
         state: InHand<S::Frame>,
@@ -152,13 +153,16 @@ where
         // Summaries are of the step before: that is what makes the result independent of timing. All of them
         // were sent before the state was, but a quicker neighbour's next one may come in between: there is
         // no order between senders.
-        let step = state.header().step - 1;
+        let now = state.header().step;
         let Some(frame) = self.ports.summaries.receive()? else {
+            if missing == 0 {
+                return self.act(&state);
+            }
             self.pending = Some((state, missing));
-            let what = "summary";
+            let (what, step) = ("summary", now - 1);
             return Ok(Progress::Waiting(Awaited { role: Role::Coordinator, missing, what, step }));
         };
-        match self.judge(frame.header(), frame.records().len(), step, missing) {
+        match self.judge(frame.header(), frame.records().len(), now, missing) {
             Ok((index, true)) => self.early.push((index, frame.records().to_vec())),
             Ok((index, false)) => {
                 self.coordinator.receive(frame.records());
@@ -181,17 +185,18 @@ where
         &self,
         header: &FrameHeader,
         records: usize,
-        step: u64,
+        now: u64,
         missing: u64,
     ) -> Result<(u16, bool), Option<Refusal>> {
         let index = header.sender_index;
-        let is_early = header.step == step + 1;
+        let is_early = header.step == now;
         let checked = ExpectedHeader {
             run_id: self.identity.run_id,
             role: Role::Coordinator,
             index,
             generation: header.generation,
-            step: if is_early { step + 1 } else { step },
+            // Before the first step nothing is due.
+            step: if is_early { now } else { now.wrapping_sub(1) },
         }
         .check(header, records);
         match checked {
@@ -252,6 +257,45 @@ mod tests {
     fn send<R: ipc_schemas::Record>(outbox: &mut impl Outbox<R>, header: FrameHeader, records: &[R]) {
         let fill = |slots: &mut crate::transport::Slots<'_, R>| records.iter().for_each(|r| slots.push(*r));
         outbox.loan(header, records.len(), fill).unwrap().send().unwrap();
+    }
+
+    #[test]
+    fn summaries_that_came_by_both_ways_leave_room_for_the_next() {
+        let scenario = Arc::new(load_embedded("tree", &[], None).unwrap());
+        let mut states = MemoryService::<VehicleState>::new();
+        let mut summaries = MemoryService::<ZoneSummary>::new();
+        let mut coordination = MemoryService::<Assignment>::new();
+        let mut out = coordination.inbox();
+        let ports = CoordinatorPorts {
+            state: states.inbox(),
+            summaries: summaries.inbox(),
+            neighbours: vec![(2, 2..3, MemoryService::new().outbox())],
+            coordination: coordination.outbox(),
+        };
+        let role = Coordinator::new(scenario, u32::from(OWN)..u32::from(OWN) + 1);
+        let identity = Identity { run_id: 7, role: Role::Coordinator, index: OWN, generation: 1 };
+        let mut driver = CoordinatorDriver::new(role, ports, identity);
+        let (mut world, mut second) = (states.outbox(), summaries.outbox());
+        let state = |step| FrameHeader {
+            coordinators_acting: 1 << OWN,
+            coordinators_summarised: 1 << 2,
+            ..header(Role::World, 0, step)
+        };
+        let mut act = |driver: &mut CoordinatorDriver<_, _, _, _>, step| {
+            while driver.advance().unwrap() == Progress::Advanced {}
+            out.receive().unwrap().map(|f| f.header().step) == Some(step)
+        };
+        // The neighbour has an event in every step; the handover in step 5 brings what it said in 4 and 5.
+        send(&mut second, header(Role::Coordinator, 2, 4), &[]);
+        send(&mut second, header(Role::Coordinator, 2, 5), &[]);
+        let handover = Handover { step: 5, header: Some(state(5)), events: 1 << 2, ..Handover::default() };
+        driver.take_over(handover);
+        assert!(act(&mut driver, 5));
+        for step in 6..9 {
+            send(&mut second, header(Role::Coordinator, 2, step), &[]);
+            send(&mut world, state(step), &[]);
+            assert!(act(&mut driver, step), "step {step}");
+        }
     }
 
     #[test]
