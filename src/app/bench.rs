@@ -38,7 +38,7 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
             deliver(args.json.as_deref(), &report, &solver_table(&report))
         }
         BenchKind::Scale(args) => {
-            let report = scale(args.measure.quick, args.with_sumo)?;
+            let report = scale(args.measure.quick, args.with_sumo.then_some(args.sumo_up_to))?;
             deliver(args.measure.json.as_deref(), &report, &scale_table(&report))
         }
         BenchKind::Peer(args) => peer(args),
@@ -146,9 +146,12 @@ fn peer(args: &PeerArgs) -> Result<(), AppError> {
 /// Vehicles from which on SUMO's clock is fine enough.
 const SUMO_FROM: usize = 1_000;
 
-fn scale(quick: bool, with_sumo: bool) -> Result<ScaleReport, AppError> {
+fn scale(quick: bool, sumo_up_to: Option<usize>) -> Result<ScaleReport, AppError> {
     // First, so that a missing package is said before minutes have passed.
-    let sumo = if with_sumo { Some((Sumo::find()?, SUMO_FROM)) } else { None };
+    let sumo = match sumo_up_to {
+        Some(most) => Some((Sumo::find()?, SUMO_FROM..=most)),
+        None => None,
+    };
     let sizes = if quick { vec![100, 1_000] } else { vec![100, 1_000, 10_000, 100_000] };
     let run = |size: usize, controllers: u32| {
         let arguments = ScenarioArgs { scenario: None, seed: None, set: vec![], corridors: Some(size) };

@@ -5,6 +5,7 @@ use super::{BenchError, Sumo};
 use crate::process::Outcome;
 use nalgebra::{DMatrix, DVector};
 use serde::Serialize;
+use std::ops::RangeInclusive;
 
 /// What to measure, and how to run a network of a given size.
 pub struct ScaleOptions<'a> {
@@ -12,8 +13,8 @@ pub struct ScaleOptions<'a> {
     pub sizes: Vec<usize>,
     /// Runs a network of that many vehicles with that many controller processes (0: all in one process).
     pub run: &'a dyn Fn(usize, u32) -> Result<Outcome, String>,
-    /// SUMO, to be measured beside ours from this many vehicles on.
-    pub sumo: Option<(Sumo, usize)>,
+    /// SUMO, and beside how many vehicles it is to be measured.
+    pub sumo: Option<(Sumo, RangeInclusive<usize>)>,
 }
 
 /// One size and number of controller processes.
@@ -94,8 +95,8 @@ pub fn scale(
                 world_bytes: outcome.peak_rss_bytes,
             };
             done(&point);
-            if let (0, Some((sumo, least))) = (controllers, &options.sumo)
-                && size >= *least
+            if let (0, Some((sumo, sizes))) = (controllers, &options.sumo)
+                && sizes.contains(&size)
             {
                 let theirs = sumo.measure(size)?;
                 beside.push(SumoPoint {

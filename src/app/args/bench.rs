@@ -42,6 +42,10 @@ pub(in crate::app) struct ScaleArgs {
     /// eclipse-sumo in the Python that CZ_PYTHON names (default: python3).
     #[arg(long)]
     pub with_sumo: bool,
+    /// Beside how many vehicles at most SUMO is measured. Ten thousand take it some minutes, a hundred thousand
+    /// far more than ten.
+    #[arg(long, value_name = "VEHICLES", default_value_t = 10_000, requires = "with_sumo")]
+    pub sumo_up_to: usize,
 }
 
 #[derive(Debug, Args)]
