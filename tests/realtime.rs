@@ -29,13 +29,14 @@ fn states_are_the_same_and_every_process_says_what_it_got() {
         (&["--rt", "--pin", "auto"], true),
         (&["--rt", "--wait", "block"], true),
         (&["--pin", "auto"], false),
+        (&["--pin", "none"], false),
     ] {
         let summary = site.summary(&[&["two-merges"], way].concat());
         assert_eq!(hash(&summary), hash(&in_process), "{way:?}");
         for process in PROCESSES {
             let got = placement(&summary, process);
             let cores = got["cores"].as_array().unwrap();
-            assert!(!cores.is_empty() && (!way.contains(&"--pin") || cores.len() == 1), "{got}");
+            assert!(!cores.is_empty() && (!way.contains(&"auto") || cores.len() == 1), "{got}");
             let scheduling = got["scheduling"].as_str().unwrap();
             if asked {
                 let fifo = if process == "coordinator 0" { "SCHED_FIFO 21" } else { "SCHED_FIFO 20" };
@@ -43,7 +44,8 @@ fn states_are_the_same_and_every_process_says_what_it_got() {
                 assert!(scheduling == fifo || scheduling.contains("(SCHED_FIFO "), "{got}");
                 assert!(got["memory_locked"] == true || got["memory_note"].is_string(), "{got}");
             } else {
-                let ordinary = if process == "coordinator 0" { "SCHED_BATCH" } else { "SCHED_OTHER" };
+                let with_controllers = process == "coordinator 0" && way.contains(&"auto");
+                let ordinary = if with_controllers { "SCHED_BATCH" } else { "SCHED_OTHER" };
                 assert_eq!(scheduling, ordinary, "{got}");
                 assert_eq!(got["memory_locked"], false, "{got}");
             }

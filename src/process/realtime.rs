@@ -72,10 +72,11 @@ impl Settling<'_> {
             (memory_locked, memory_note) = lock_memory();
         }
         let refusal = if self.realtime { ask_for_fifo(role, wait, hot_processes).err() } else { None };
-        if !self.realtime && role == Role::Coordinator && wait == WaitMode::Hybrid {
+        let is_with_controllers = self.pin == Placement::Auto && wait == WaitMode::Hybrid;
+        if !self.realtime && role == Role::Coordinator && is_with_controllers {
             // A controller that waits for it yields. So its waking need not interrupt the core, which takes longer
-            // than the next yield is away.
-            schedule(NormalThreadSchedulePolicy::Batch);
+            // than the next yield is away. On any other core it would wait for whoever is there.
+            put_under(NormalThreadSchedulePolicy::Batch);
         }
         let scheduling = match refusal {
             Some(why) => format!("{} ({why})", scheduling()),
@@ -99,13 +100,13 @@ pub struct Held(());
 impl Drop for Held {
     fn drop(&mut self) {
         if is_fifo() {
-            schedule(NormalThreadSchedulePolicy::Other);
+            put_under(NormalThreadSchedulePolicy::Other);
         }
     }
 }
 
 /// Puts the calling thread under a policy that is not real-time, which is always allowed, as nice as it is.
-fn schedule(policy: NormalThreadSchedulePolicy) {
+fn put_under(policy: NormalThreadSchedulePolicy) {
     let niceness = getpriority_process(None);
     // The library always sets niceness too, and makes 0 of 49 of 99: the way back from there is open to all but
     // who was not nice at all.
