@@ -20,36 +20,25 @@ impl WorldLine {
     }
 }
 
-/// What each process says on stderr before its run begins: where it is and what it was granted.
-#[derive(Debug)]
-pub(super) struct SettledLine(pub Settled);
-
-impl SettledLine {
-    /// Sets the line apart from everything else that is said on stderr.
-    const MARK: &str = "cz-settled ";
-
-    pub fn to_line(&self) -> String {
-        format!("{}{}", Self::MARK, serde_json::to_string(&self.0).expect("it has string keys only"))
-    }
-
-    pub fn of(line: &str) -> Option<SettledLine> {
-        serde_json::from_str(line.strip_prefix(Self::MARK)?).ok().map(SettledLine)
-    }
+/// What a process says on stderr to its supervisor, one JSON object a line.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(super) enum PartLine {
+    /// Before its run begins: where it is and what it was granted.
+    Settled(Settled),
+    /// When it ends, if it is a coordinator or controller: whose frames it has refused.
+    Refused(RefusedFrames),
 }
 
-/// What a coordinator or controller says on stderr when it ends: whose frames it has refused.
-#[derive(Debug)]
-pub(super) struct RefusedLine(pub RefusedFrames);
-
-impl RefusedLine {
+impl PartLine {
     /// Sets the line apart from everything else that is said on stderr.
-    const MARK: &str = "cz-refused ";
+    const MARK: &str = "cz-part ";
 
     pub fn to_line(&self) -> String {
-        format!("{}{}", Self::MARK, serde_json::to_string(&self.0).expect("it has string keys only"))
+        format!("{}{}", Self::MARK, serde_json::to_string(self).expect("it has string keys only"))
     }
 
-    pub fn of(line: &str) -> Option<RefusedLine> {
-        serde_json::from_str(line.strip_prefix(Self::MARK)?).ok().map(RefusedLine)
+    pub fn of(line: &str) -> Option<PartLine> {
+        serde_json::from_str(line.strip_prefix(Self::MARK)?).ok()
     }
 }

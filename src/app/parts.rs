@@ -1,7 +1,7 @@
 //! `cz world`, `cz coord`, `cz ctrl`: one process of a run.
 
 use super::args::{PartArgs, Restart, WaitArgs, WorldArgs};
-use super::lines::{RefusedLine, SettledLine, WorldLine};
+use super::lines::{PartLine, WorldLine};
 use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::{AppError, record};
@@ -102,7 +102,7 @@ fn settling<'a>(wait: &WaitArgs, report: &'a dyn Fn(&Settled)) -> Settling<'a> {
 /// people when they have asked.
 fn report_to(supervisor: Option<u32>, wait: &WaitArgs) -> Box<dyn Fn(&Settled)> {
     match (supervisor, wait.rt) {
-        (Some(_), _) => Box::new(|settled| eprintln!("{}", SettledLine(settled.clone()).to_line())),
+        (Some(_), _) => Box::new(|settled| eprintln!("{}", PartLine::Settled(settled.clone()).to_line())),
         (None, true) => Box::new(|settled| eprintln!("{settled}")),
         (None, false) => Box::new(|_| {}),
     }
@@ -112,7 +112,7 @@ fn report_to(supervisor: Option<u32>, wait: &WaitArgs) -> Box<dyn Fn(&Settled)> 
 fn refused_to(args: &PartArgs) -> impl Fn(RefusedFrames) + use<> {
     let is_supervised = args.supervised.is_some();
     move |refused| match is_supervised {
-        true => eprintln!("{}", RefusedLine(refused).to_line()),
+        true => eprintln!("{}", PartLine::Refused(refused).to_line()),
         false => eprintln!("{refused}"),
     }
 }

@@ -2,7 +2,7 @@
 
 use super::AppError;
 use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs};
-use super::lines::{RefusedLine, SettledLine, WorldLine};
+use super::lines::{PartLine, WorldLine};
 use super::record::Recording;
 use super::run::Position;
 use crate::lockstep::RefusedFrames;
@@ -321,12 +321,12 @@ impl Family {
         let member = &mut self.children[child];
         if self.plugins.contains(&child) {
             eprintln!("[{}] {line}", member.name);
-        } else if let Some(SettledLine(settled)) = SettledLine::of(&line) {
-            member.settled = Some(settled);
-            return;
-        } else if let Some(RefusedLine(refused)) = RefusedLine::of(&line) {
-            self.refused.push(refused);
-            return;
+        } else {
+            match PartLine::of(&line) {
+                Some(PartLine::Settled(settled)) => return member.settled = Some(settled),
+                Some(PartLine::Refused(refused)) => return self.refused.push(refused),
+                None => {}
+            }
         }
         member.last_words = Some(line);
     }
