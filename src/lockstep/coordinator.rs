@@ -243,7 +243,7 @@ where
 mod tests {
     use super::*;
     use crate::scenario::load_embedded;
-    use crate::transport::memory::MemoryService;
+    use crate::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
     use ipc_schemas::FrameHeader;
     use std::sync::Arc;
 
@@ -259,90 +259,96 @@ mod tests {
         outbox.loan(header, records.len(), fill).unwrap().send().unwrap();
     }
 
+    type TestDriver = CoordinatorDriver<
+        MemoryInbox<VehicleState>,
+        MemoryInbox<ZoneSummary>,
+        MemoryOutbox<ZoneSummary>,
+        MemoryOutbox<Assignment>,
+    >;
+
+    /// A coordinator with these neighbours, and the services by which the others reach it and hear of it.
+    struct Scene {
+        driver: TestDriver,
+        states: MemoryService<VehicleState>,
+        summaries: MemoryService<ZoneSummary>,
+        coordination: MemoryInbox<Assignment>,
+    }
+
+    impl Scene {
+        fn new(neighbours: &[u16], generation: u32) -> Scene {
+            let scenario = Arc::new(load_embedded("tree", &[], None).unwrap());
+            let mut states = MemoryService::new();
+            let mut summaries = MemoryService::new();
+            let mut coordination = MemoryService::new();
+            let inbox = coordination.inbox();
+            let neighbour = |&i: &u16| (i, u32::from(i)..u32::from(i) + 1, MemoryService::new().outbox());
+            let ports = CoordinatorPorts {
+                state: states.inbox(),
+                summaries: summaries.inbox(),
+                neighbours: neighbours.iter().map(neighbour).collect(),
+                coordination: coordination.outbox(),
+            };
+            let role = Coordinator::new(scenario, u32::from(OWN)..u32::from(OWN) + 1);
+            let identity = Identity { run_id: 7, role: Role::Coordinator, index: OWN, generation };
+            let driver = CoordinatorDriver::new(role, ports, identity);
+            Scene { driver, states, summaries, coordination: inbox }
+        }
+
+        /// Whether the coordinator now acts in the step.
+        fn acts(&mut self, step: u64) -> bool {
+            while self.driver.advance().unwrap() == Progress::Advanced {}
+            self.coordination.receive().unwrap().map(|f| f.header().step) == Some(step)
+        }
+    }
+
+    fn state(step: u64, summarised: u64) -> FrameHeader {
+        FrameHeader {
+            coordinators_acting: 1 << OWN,
+            coordinators_summarised: summarised,
+            ..header(Role::World, 0, step)
+        }
+    }
+
     #[test]
     fn summaries_that_came_by_both_ways_leave_room_for_the_next() {
-        let scenario = Arc::new(load_embedded("tree", &[], None).unwrap());
-        let mut states = MemoryService::<VehicleState>::new();
-        let mut summaries = MemoryService::<ZoneSummary>::new();
-        let mut coordination = MemoryService::<Assignment>::new();
-        let mut out = coordination.inbox();
-        let ports = CoordinatorPorts {
-            state: states.inbox(),
-            summaries: summaries.inbox(),
-            neighbours: vec![(2, 2..3, MemoryService::new().outbox())],
-            coordination: coordination.outbox(),
-        };
-        let role = Coordinator::new(scenario, u32::from(OWN)..u32::from(OWN) + 1);
-        let identity = Identity { run_id: 7, role: Role::Coordinator, index: OWN, generation: 1 };
-        let mut driver = CoordinatorDriver::new(role, ports, identity);
-        let (mut world, mut second) = (states.outbox(), summaries.outbox());
-        let state = |step| FrameHeader {
-            coordinators_acting: 1 << OWN,
-            coordinators_summarised: 1 << 2,
-            ..header(Role::World, 0, step)
-        };
-        let mut act = |driver: &mut CoordinatorDriver<_, _, _, _>, step| {
-            while driver.advance().unwrap() == Progress::Advanced {}
-            out.receive().unwrap().map(|f| f.header().step) == Some(step)
-        };
+        let mut scene = Scene::new(&[2], 1);
+        let (mut world, mut second) = (scene.states.outbox(), scene.summaries.outbox());
         // The neighbour has an event in every step; the handover in step 5 brings what it said in 4 and 5.
         send(&mut second, header(Role::Coordinator, 2, 4), &[]);
         send(&mut second, header(Role::Coordinator, 2, 5), &[]);
-        let handover = Handover { step: 5, header: Some(state(5)), events: 1 << 2, ..Handover::default() };
-        driver.take_over(handover);
-        assert!(act(&mut driver, 5));
+        let header_5 = Some(state(5, 1 << 2));
+        let handover = Handover { step: 5, header: header_5, events: 1 << 2, ..Handover::default() };
+        scene.driver.take_over(handover);
+        assert!(scene.acts(5));
         for step in 6..9 {
             send(&mut second, header(Role::Coordinator, 2, step), &[]);
-            send(&mut world, state(step), &[]);
-            assert!(act(&mut driver, step), "step {step}");
+            send(&mut world, state(step, 1 << 2), &[]);
+            assert!(scene.acts(step), "step {step}");
         }
     }
 
     #[test]
     fn a_quick_neighbours_next_summary_waits_for_its_step() {
-        let scenario = Arc::new(load_embedded("tree", &[], None).unwrap());
-        let mut states = MemoryService::<VehicleState>::new();
-        let mut summaries = MemoryService::<ZoneSummary>::new();
-        let mut coordination = MemoryService::<Assignment>::new();
-        let mut out = coordination.inbox();
-        let ports = CoordinatorPorts {
-            state: states.inbox(),
-            summaries: summaries.inbox(),
-            neighbours: [2, 4]
-                .map(|i| (i, u32::from(i)..u32::from(i) + 1, MemoryService::new().outbox()))
-                .into(),
-            coordination: coordination.outbox(),
-        };
-        let role = Coordinator::new(scenario, u32::from(OWN)..u32::from(OWN) + 1);
-        let identity = Identity { run_id: 7, role: Role::Coordinator, index: OWN, generation: 0 };
-        let mut driver = CoordinatorDriver::new(role, ports, identity);
-        let (mut world, mut second, mut fourth) = (states.outbox(), summaries.outbox(), summaries.outbox());
-        let state = |step, summarised| FrameHeader {
-            coordinators_acting: 1 << OWN,
-            coordinators_summarised: summarised,
-            ..header(Role::World, 0, step)
-        };
-        let mut act = |driver: &mut CoordinatorDriver<_, _, _, _>, step| {
-            while driver.advance().unwrap() == Progress::Advanced {}
-            out.receive().unwrap().map(|f| f.header().step) == Some(step)
-        };
+        let mut scene = Scene::new(&[2, 4], 0);
+        let (mut world, mut second) = (scene.states.outbox(), scene.summaries.outbox());
+        let mut fourth = scene.summaries.outbox();
 
         send(&mut second, header(Role::Coordinator, 2, 0), &[]);
         send(&mut world, state(1, 1 << 2 | 1 << 4), &[]);
         // The second one has taken state 1 too, acted, and sent the next summary.
         send(&mut second, header(Role::Coordinator, 2, 1), &[]);
-        assert!(!act(&mut driver, 1), "the fourth one's summary is missing");
+        assert!(!scene.acts(1), "the fourth one's summary is missing");
         send(&mut fourth, header(Role::Coordinator, 4, 0), &[]);
-        assert!(act(&mut driver, 1));
+        assert!(scene.acts(1));
         send(&mut world, state(2, 1 << 2), &[]);
-        assert!(act(&mut driver, 2), "the early summary counts now");
+        assert!(scene.acts(2), "the early summary counts now");
         send(&mut world, state(3, 1 << 4), &[]);
-        assert!(!act(&mut driver, 3));
+        assert!(!scene.acts(3));
         // Two steps early is nobody's right.
         send(&mut fourth, header(Role::Coordinator, 4, 4), &[]);
-        assert!(!act(&mut driver, 3), "it waits for the right one");
-        assert_eq!(driver.refused().len(), 1);
-        let told = driver.refused()[0].to_string();
+        assert!(!scene.acts(3), "it waits for the right one");
+        assert_eq!(scene.driver.refused().len(), 1);
+        let told = scene.driver.refused()[0].to_string();
         let expected = "coordinator 3 refused 1 frames of coordinator 4; the last: ";
         assert!(told.starts_with(expected) && told.contains("step"), "{told}");
     }
