@@ -45,23 +45,14 @@ struct Supervised {
 
 impl Supervised {
     fn start(site: &Site, arguments: &[&str], processes: usize) -> Supervised {
-        let supervisor = site.start("cz", &[&ENDLESS, arguments].concat());
-        let mut parts = Vec::new();
-        wait_until("the supervisor to have started the parts", || {
-            // Between fork and exec a child has the command line of its parent.
-            parts = children(supervisor.id())
-                .into_iter()
-                .filter_map(|(id, line)| line.get(1).filter(|part| *part != "run").map(|p| (p.clone(), id)))
-                .collect();
-            parts.len() == processes
-        });
+        let (supervisor, parts) = common::begin(site, &[&ENDLESS, arguments].concat(), processes);
         let run = Supervised { supervisor, parts };
         wait_until_stepping(run.part("world"));
         run
     }
 
     fn part(&self, name: &str) -> u32 {
-        self.parts.iter().find(|(part, _)| part == name).unwrap_or_else(|| panic!("no {name}")).1
+        common::part(&self.parts, name)
     }
 
     fn wait_until_parts_have_ended(&self, limit: Duration) {

@@ -294,6 +294,7 @@ pub fn begin(site: &Site, arguments: &[&str], processes: usize) -> (Process, Vec
     let supervisor = site.start("cz", arguments);
     let mut parts = Vec::new();
     wait_until("the supervisor to have started the parts", || {
+        // Between fork and exec a child has the command line of its parent.
         parts = children(supervisor.id())
             .into_iter()
             .filter_map(|(id, line)| line.get(1).filter(|part| *part != "run").map(|p| (p.clone(), id)))
