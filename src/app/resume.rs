@@ -29,7 +29,7 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
     let reader = record::open(&args.file)?;
     let scenario = reader.scenario().clone();
     let first = first_missing_step(&reader);
-    args.conduct.timing.timing()?;
+    args.supervised.conduct.timing.timing()?;
     let last = reader.steps().map_while(Result::ok).last();
     if last.is_some_and(|step| step.header.flags & ipc_schemas::FLAG_END_OF_RUN != 0) {
         let problem = format!("{}: the run is complete; nothing is left to be resumed", args.file.display());
@@ -39,12 +39,12 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
     let share = record::share_of(&reader);
     let none = ScenarioArgs::none();
     let plan = Plan {
-        run: args.run.clone().unwrap_or_else(own_name),
+        run: args.supervised.run.clone().unwrap_or_else(own_name),
         scenario: &none,
         plugins: &scenario.plugins,
         pool: scenario.controllers(share.ctrl_procs) - scenario.plugins.len() as u32,
         share,
-        conduct: args.conduct,
+        conduct: args.supervised.conduct,
         run_id: new_run_id(),
         resume: Some(&args.file),
     };
@@ -57,9 +57,9 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
     bar.finish();
     let recorded = recording.map_or(Ok(()), |recording| recording.finish(&outcome));
     let processes = 1 + share.coord_procs + scenario.controllers(share.ctrl_procs);
-    let asked = args.conduct.wait.asks_for_placement();
+    let asked = args.supervised.conduct.wait.asks_for_placement();
     let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome?);
-    summary.with_placement(asked).deliver(args.json.as_deref())?;
+    summary.with_placement(asked).deliver(args.supervised.json.as_deref())?;
     recorded
 }
 

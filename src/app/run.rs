@@ -19,15 +19,15 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
     let (arguments, scenario) = controllers::load(&arguments, &args.controllers)?;
     let scenario = Arc::new(scenario);
     args.share.check(&scenario)?;
-    if args.conduct.wait_mode == WaitMode::Spin && !args.in_process {
+    if args.supervised.conduct.wait_mode == WaitMode::Spin && !args.in_process {
         check_cores(1 + (args.share.coord_procs + args.share.ctrl_procs) as usize)?;
     }
     if args.in_process && !scenario.plugins.is_empty() {
         let problem = "--in-process: the scenario has controllers that are processes of their own";
         return Err(AppError::Usage(problem.to_owned()));
     }
-    args.conduct.timing.timing()?;
-    if args.in_process && args.conduct.timing.is_given() {
+    args.supervised.conduct.timing.timing()?;
+    if args.in_process && args.supervised.conduct.timing.is_given() {
         let problem =
             "--in-process: nobody else can be late; --pace and --deadline are for several processes";
         return Err(AppError::Usage(problem.to_owned()));
@@ -59,12 +59,12 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
     } else {
         let processes = 1 + args.share.coord_procs + scenario.controllers(args.share.ctrl_procs);
         let plan = Plan {
-            run: args.run.clone().unwrap_or_else(own_name),
+            run: args.supervised.run.clone().unwrap_or_else(own_name),
             scenario: &arguments,
             plugins: &scenario.plugins,
             pool: scenario.controllers(args.share.ctrl_procs) - scenario.plugins.len() as u32,
             share: args.share,
-            conduct: args.conduct,
+            conduct: args.supervised.conduct,
             run_id: new_run_id(),
             resume: None,
         };
@@ -80,8 +80,10 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         (Transport::Iceoryx2 { processes }, outcome)
     };
     bar.finish();
-    let asked = args.conduct.wait.asks_for_placement();
-    Summary::new(&scenario, transport, outcome?).with_placement(asked).deliver(args.json.as_deref())?;
+    let asked = args.supervised.conduct.wait.asks_for_placement();
+    Summary::new(&scenario, transport, outcome?)
+        .with_placement(asked)
+        .deliver(args.supervised.json.as_deref())?;
     // A recording that failed does not take the results with it.
     recorded
 }

@@ -11,7 +11,7 @@ pub(super) use bench::{BenchArgs, BenchKind, PeerArgs};
 use clap::{Args, Parser, Subcommand};
 pub(super) use conduct::{ConductArgs, Restart, ShareArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
-pub(super) use run::{PartArgs, RunArgs, WorldArgs};
+pub(super) use run::{PartArgs, RunArgs, SupervisedArgs, WorldArgs};
 pub(super) use scenario::ScenarioArgs;
 use std::path::PathBuf;
 

@@ -1,7 +1,6 @@
 //! Arguments of what works on recordings.
 
-use super::ConductArgs;
-use crate::transport::iox::RunName;
+use super::SupervisedArgs;
 use clap::Args;
 use std::path::PathBuf;
 
@@ -47,18 +46,12 @@ pub(in crate::app) struct ReplayArgs {
 pub(in crate::app) struct ResumeArgs {
     /// The recording; it decides the scenario and the numbers of processes.
     pub file: PathBuf,
-    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
-    #[arg(long, value_name = "FILE|-")]
-    pub json: Option<PathBuf>,
     /// Record the run in this file, its past included: a recording of the whole run. Not the file it goes on
     /// from; an older recording is replaced.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
-    /// Name of the run; runs of different names do not see each other [default: one of its own].
-    #[arg(long, value_name = "NAME")]
-    pub run: Option<RunName>,
     #[command(flatten)]
-    pub conduct: ConductArgs,
+    pub supervised: SupervisedArgs,
 }
 
 #[derive(Debug, Args)]

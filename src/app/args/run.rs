@@ -22,12 +22,19 @@ pub(in crate::app) struct RunArgs {
     /// What becomes of commands that are not safe, in place of the scenario's `shield`: off, observe, on.
     #[arg(long, value_name = "MODE")]
     pub shield: Option<String>,
-    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
-    #[arg(long, value_name = "FILE|-")]
-    pub json: Option<PathBuf>,
     /// Record every frame of the run in this file (.czlog); an older recording is replaced.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
+    #[command(flatten)]
+    pub supervised: SupervisedArgs,
+}
+
+/// What goes for every run that `cz` starts all processes of.
+#[derive(Debug, Args)]
+pub(in crate::app) struct SupervisedArgs {
+    /// Also write the summary as JSON to this file; `-` for stdout, which then holds nothing else.
+    #[arg(long, value_name = "FILE|-")]
+    pub json: Option<PathBuf>,
     /// Name of the run; runs of different names do not see each other [default: one of its own].
     #[arg(long, value_name = "NAME")]
     pub run: Option<RunName>,
