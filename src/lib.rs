@@ -13,6 +13,7 @@ pub mod record;
 pub mod reproduce;
 pub mod scenario;
 pub mod shield;
+pub mod step;
 pub mod transport;
 pub mod vehicle;
 pub mod world;

@@ -6,8 +6,7 @@ use super::report::{Summary, Transport};
 use super::run::{Bar, own_name};
 use super::supervise::{Plan, supervise};
 use super::{AppError, print, record};
-use crate::lockstep::in_process::{InProcess, RestoreError};
-use crate::process::{StopFlag, first_missing_step, new_run_id, run_on_in_process};
+use crate::process::{RestoreError, StopFlag, first_missing_step, new_run_id, restore, run_on_in_process};
 use crate::record::{FileSource, Reader};
 use crate::scenario::{Override, Scenario, load_recorded};
 use crate::world::{World, WorldSummary};
@@ -98,7 +97,7 @@ fn future(
     scenario: Option<&Arc<Scenario>>,
     stop: &StopFlag,
 ) -> Result<WorldSummary, AppError> {
-    let run = InProcess::from_recording(reader, at, scenario.cloned())?;
+    let run = restore(reader, at, scenario.cloned())?;
     Ok(run_on_in_process(run, stop, |_: &World| {})?.world)
 }
 

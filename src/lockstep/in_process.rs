@@ -6,14 +6,12 @@ use super::{
 };
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
-use crate::record::{
-    CommandPart, Metadata, POLICY_NONE, Reader, ReplayError, Source, StepFrames, replay_world,
-};
 use crate::scenario::Scenario;
 use crate::scenario::share::{neighbour_coordinators, zones_of};
+use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::memory::{MemoryFrame, MemoryInbox, MemoryOutbox, MemoryService};
 use crate::transport::{Frame, Inbox};
-use crate::world::{ChangeError, World};
+use crate::world::World;
 use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::sync::Arc;
 
@@ -31,6 +29,9 @@ type CoordinatorSide = CoordinatorDriver<
 >;
 type ControllerSide =
     ControllerDriver<MemoryInbox<VehicleState>, MemoryInbox<Assignment>, MemoryOutbox<VehicleCommand>>;
+
+/// What is kept of a run in one thread.
+pub type MemoryLedger = Ledger<MemoryFrame<VehicleCommand>>;
 
 /// World, coordinators and controllers of a run, in one thread.
 #[derive(Debug)]
@@ -51,17 +52,6 @@ struct Observer {
     command: MemoryInbox<VehicleCommand>,
 }
 
-/// Why a recorded run cannot go on.
-#[derive(Debug, thiserror::Error)]
-pub enum RestoreError {
-    /// The recording cannot be replayed that far.
-    #[error(transparent)]
-    Replay(#[from] ReplayError),
-    /// The other scenario is too different.
-    #[error(transparent)]
-    Change(#[from] ChangeError),
-}
-
 impl InProcess {
     /// The run id of all frames.
     pub const RUN_ID: u64 = 1;
@@ -72,22 +62,9 @@ impl InProcess {
         InProcess::build(World::new(InProcess::own(scenario), coordinators), coordinators, controllers, false)
     }
 
-    /// A recorded run that goes on before a step, under another scenario if there is one.
-    pub fn from_recording<S: Source>(
-        reader: &Reader<S>,
-        step: u64,
-        scenario: Option<Arc<Scenario>>,
-    ) -> Result<InProcess, RestoreError> {
-        let Metadata { coordinators, controllers, .. } = *reader.metadata();
-        let mut world = replay_world(reader, step)?;
-        if let Some(scenario) = scenario {
-            world.change(scenario)?;
-        }
-        let mut ledger = Ledger::<MemoryFrame<VehicleCommand>>::new(world.scenario(), controllers);
-        // Behind these the file may be cut off.
-        for recorded in reader.steps().take(step as usize) {
-            ledger.relive(&recorded.map_err(ReplayError::from)?);
-        }
+    /// A run that goes on with the world as it stands, from what the ledger has of the steps before.
+    pub fn going_on(world: World, ledger: &MemoryLedger, coordinators: u32, controllers: u32) -> InProcess {
+        let step = world.step();
         let mut run = InProcess::build(world, coordinators, controllers, false);
         for (index, coordinator) in run.coordinators.iter_mut().enumerate() {
             coordinator.take_over(Handover { step, ..ledger.handover(Role::Coordinator, index) });
@@ -95,7 +72,7 @@ impl InProcess {
         for (index, controller) in run.controllers.iter_mut().enumerate() {
             controller.take_over(Handover { step, ..ledger.handover(Role::Controller, index) });
         }
-        Ok(run)
+        run
     }
 
     /// The scenario without plug-ins.

@@ -8,8 +8,8 @@
 //! there arrives twice and is the same.
 
 use crate::coordination::{Audience, is_event};
-use crate::record::Step;
 use crate::scenario::Scenario;
+use crate::step::Step;
 use crate::transport::Frame;
 use ipc_schemas::{Assignment, FrameHeader, Role, VehicleCommand, VehicleState, ZoneSummary};
 use serde::{Deserialize, Serialize};

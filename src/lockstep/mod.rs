@@ -18,7 +18,7 @@ pub use refusals::{Refusal, RefusedFrames};
 pub use world::{Seat, WorldDriver, WorldPorts};
 
 use crate::control::pool::PoolError;
-use crate::record::StepFrames;
+use crate::step::StepFrames;
 use crate::transport::{Frame, TransportError};
 use ipc_schemas::{FrameHeader, HeaderFault, Role, VehicleState};
 

@@ -5,8 +5,8 @@ use super::{
     Awaited, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal, RefusedFrames, mask_of,
     sender,
 };
-use crate::record::{CommandPart, POLICY_NONE, StepFrames};
 use crate::scenario::share::zones_of;
+use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots};
 use crate::world::{Sheet, World};
 use ipc_schemas::{

@@ -2,8 +2,8 @@
 
 use super::ProcessError;
 use crate::lockstep::Observer;
-use crate::record::{Step, StepFrames};
 use crate::scenario::Scenario;
+use crate::step::{Step, StepFrames};
 use crate::transport::TransportError;
 use crate::transport::iox::{BlockOutbox, RunName, RunSpace, SpaceError};
 use ipc_schemas::{Assignment, SERVICE_OBSERVER, VehicleCommand, VehicleState};

@@ -7,6 +7,7 @@
 //! All parts are multiples of 8 bytes, little-endian, records as they travel. The head ends with a checksum
 //! of its own, so that the length in it may be believed before the rest has been read.
 
+use crate::step::{CommandPart, Commands, Step, StepFrames};
 use ipc_schemas::{
     Assignment, FrameHeader, Record, VehicleCommand, VehicleState, ZoneSummary, bytes_of, records_from,
 };
@@ -15,43 +16,6 @@ use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 /// First bytes of a block.
 pub const BLOCK_MAGIC: [u8; 8] = *b"CZstep\0\x01";
-
-/// [`StepFrames::policy`]: nobody missed the step, or nothing was put in anybody's place.
-pub const POLICY_NONE: u32 = 0;
-
-/// One step as the world saw it, borrowed from where its frames lie.
-///
-/// A list of slices stands for their concatenation, so that frames of several processes need not be copied
-/// together first.
-#[derive(Clone, Copy, Debug)]
-pub struct StepFrames<'a> {
-    /// Header of the state frame; its record count is set by the encoding.
-    pub header: FrameHeader,
-    /// The state frame's records.
-    pub state: &'a [VehicleState],
-    /// Summaries sent in this step between coordinator processes, in any order.
-    pub summaries: &'a [&'a [ZoneSummary]],
-    /// Assignments of all coordinators that acted, zones ascending.
-    pub coordination: &'a [&'a [Assignment]],
-    /// Commands as they were handed to the gateway, one part per controller process in order of index; none
-    /// in the last step of a run.
-    pub commands: &'a [CommandPart<'a>],
-    /// Bit `i`: controller `i` did not answer in time, and its part is what the world put in its place.
-    pub misses: u64,
-    /// How the world chose that: a code of the world's; [`POLICY_NONE`] where there are no misses.
-    pub policy: u32,
-    /// The world's state hash with this state frame in it.
-    pub state_hash: u64,
-}
-
-/// The commands of one controller process.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct CommandPart<'a> {
-    /// Generation of the process that sent them.
-    pub generation: u32,
-    /// The records.
-    pub records: &'a [VehicleCommand],
-}
 
 /// What a block starts with.
 #[derive(Clone, Copy, Debug, FromBytes, IntoBytes, Immutable)]
@@ -191,36 +155,6 @@ impl StepFrames<'_> {
     }
 }
 
-/// One step read back.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Step {
-    /// Header of the state frame.
-    pub header: FrameHeader,
-    /// The state frame's records.
-    pub state: Vec<VehicleState>,
-    /// Summaries sent in this step between coordinator processes.
-    pub summaries: Vec<ZoneSummary>,
-    /// Assignments of all coordinators that acted.
-    pub coordination: Vec<Assignment>,
-    /// Commands per controller process.
-    pub commands: Vec<Commands>,
-    /// Controllers in whose place the world decided, one bit each.
-    pub misses: u64,
-    /// How it did.
-    pub policy: u32,
-    /// The world's state hash with this state frame in it.
-    pub state_hash: u64,
-}
-
-/// The commands of one controller process, read back.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Commands {
-    /// Generation of the process that sent them.
-    pub generation: u32,
-    /// The records.
-    pub records: Vec<VehicleCommand>,
-}
-
 impl Step {
     /// The number of the step a block is of, if it is one.
     pub fn number_in(block: &[u8]) -> Option<u64> {
@@ -279,11 +213,6 @@ impl Step {
         let mut bytes = Vec::new();
         frames.encode_onto(&mut bytes);
         bytes
-    }
-
-    /// Whether a controller did not answer in time.
-    pub fn missed(&self, controller: usize) -> bool {
-        controller < 64 && self.misses >> controller & 1 == 1
     }
 }
 

@@ -4,8 +4,8 @@
 //! differ between equal runs is not: run ids, generations, and, where the numbers of processes differ, what
 //! depends on these: masks of processes and the summaries between them.
 
-use super::block::Step;
 use super::reader::{Damage, Flaw, Reader, Source};
+use crate::step::Step;
 use ipc_schemas::{Assignment, Record, Scalar, VehicleCommand, VehicleState, ZoneSummary, bytes_of};
 use serde::Serialize;
 

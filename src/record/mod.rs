@@ -1,6 +1,6 @@
 //! Recordings of runs: every frame of every step in one file, and what can be done with it.
 //!
-//! The writing side takes [`StepFrames`] from whoever has seen a step, as one block of bytes that can be made
+//! The writing side takes [`StepFrames`](crate::step::StepFrames) from whoever has seen a step, as one block of bytes that can be made
 //! in one process and written by another. The reading side trusts nothing: see [`Reader`].
 
 mod block;
@@ -13,7 +13,8 @@ mod replay;
 mod reseal;
 mod writer;
 
-pub use block::{BlockFault, CommandPart, Commands, POLICY_NONE, Step, StepFrames};
+pub use crate::step::{CommandPart, Commands, Step, StepFrames};
+pub use block::BlockFault;
 pub use compare::{Comparison, Difference, Section, compare};
 pub use format::{Build, Footer, Metadata, Processes, RunEnd, ScenarioSource};
 pub use reader::{Damage, FileSource, Flaw, OpenError, Reader, Source, Steps};

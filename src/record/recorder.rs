@@ -4,9 +4,9 @@
 //! footer, and for whoever asks at the end. What has been written is handed to the system every 100 ms, so a
 //! program that is killed loses no more than that; at the end it is forced onto the disk.
 
-use super::block::{Step, StepFrames};
 use super::format::{FILE_MAGIC, Metadata, RunEnd};
 use super::writer::{WriteError, Writer};
+use crate::step::{Step, StepFrames};
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
 use std::fs::{File, OpenOptions};
 use std::io::{self, BufWriter, Read, Write};

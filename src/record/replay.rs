@@ -3,13 +3,13 @@
 //! Each role gets its recorded inputs, not what another role has just computed: so it is the role that differs
 //! that is found, and not all that depend on it.
 
-use super::block::Step;
 use super::compare::{Difference, Rules, first_difference};
 use super::reader::{Damage, Reader, Source};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::scenario::share::zones_of;
 use crate::scenario::{Drivers, Scenario};
+use crate::step::Step;
 use crate::world::World;
 use ipc_schemas::{
     Assignment, FLAG_END_OF_RUN, FLAG_MISSED, NO_ZONE, STATE_LEFT, VehicleCommand, VehicleState, ZoneSummary,

@@ -16,9 +16,10 @@ pub use head::OpenError;
 pub use source::{FileSource, Source};
 pub use steps::Steps;
 
-use super::block::{BlockHead, HEAD, Step};
+use super::block::{BlockHead, HEAD};
 use super::format::{Digest, END_MAGIC, Entry, Footer, Metadata, Seal, digest};
 use crate::scenario::Scenario;
+use crate::step::Step;
 use end::End;
 use head::Head;
 use source::bytes;

@@ -1,8 +1,9 @@
 //! The steps of a file without a sound index, looked for one after the other.
 
-use super::super::block::{BLOCK_MAGIC, Step};
+use super::super::block::BLOCK_MAGIC;
 use super::super::format::{Digest, END_MAGIC, Entry, Seal, next_link};
 use super::{Damage, Flaw, OpenError, Reader, Source};
+use crate::step::Step;
 use std::io;
 
 impl<S: Source> Reader<S> {

@@ -1,8 +1,8 @@
 //! All steps of a recording, one after the other.
 
-use super::super::block::Step;
 use super::super::format::{Digest, Entry, next_link};
 use super::{Damage, Flaw, Reader, Source, numbered};
+use crate::step::Step;
 
 /// The steps of a recording in order; a damaged place is an error, after which the rest follows.
 #[derive(Debug)]
