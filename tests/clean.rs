@@ -61,17 +61,16 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     let site = Site::new("clean");
     let alive = common::unique_name("alive");
     let in_process = site.summary(&["corridor-8", "--in-process"]);
-    let (supervisor, parts) = start_long(&site, site.run(), &[]);
-    wait_until("the run to have files", || site.files().len() > 10);
-    massacre(supervisor, &parts);
-    let left = site.files();
-    assert!(left.len() > 10, "killed processes leave files: {left:?}");
-
+    let (supervisor, dying) = start_long(&site, site.run(), &[]);
     let (survivor, parts) = start_long(&site, &alive, &["--json", "-"]);
     // It stands still while others are cleared away, so that it is certainly there.
     let has_services = || files(Some(site.runs().parent().unwrap()), &alive).len() > 10;
     wait_until("the other run to have services", has_services);
     send(world(&parts), Signal::STOP);
+    wait_until("the run to have files", || site.files().len() > 10);
+    massacre(supervisor, &dying);
+    let left = site.files();
+    assert!(left.len() > 10, "killed processes leave files: {left:?}");
 
     // What only looks like ours: another runtime directory, another user, no run at all, alive.
     let shm = Path::new("/dev/shm");
@@ -97,12 +96,7 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     ];
     measurement.iter().for_each(|path| std::fs::write(path, "").unwrap());
 
-    // A run that died a moment ago could also be one that is about to begin.
-    let mut said = String::new();
-    wait_until("the dead run to be old enough", || {
-        said = clean(&site, temporary.path(), &["--dry-run"]);
-        said.contains(&format!("would remove {}", left[0].display()))
-    });
+    let said = clean(&site, temporary.path(), &["--dry-run"]);
     let lines = |said: &str, what: &str| -> Vec<PathBuf> {
         let mut paths: Vec<_> =
             said.lines().filter_map(|l| l.strip_prefix(what)).map(PathBuf::from).collect();
@@ -174,4 +168,120 @@ fn what_a_run_creates_is_private() {
         clean(&site, temporary.path(), &[]);
         site.files().is_empty()
     });
+}
+
+/// `cz` where there is no runtime directory but this temporary one.
+fn cz_in(site: &Site, temporary: &Path, arguments: &[&str]) -> std::process::Output {
+    let mut command = site.command("cz");
+    command.env_remove("XDG_RUNTIME_DIR").env("TMPDIR", temporary).args(arguments).output().unwrap()
+}
+
+#[test]
+fn what_is_not_a_run_is_neither_removed_nor_used() {
+    let _alone = ALONE.lock();
+    let site = Site::new("photos");
+    let photos = site.runs().join("photos");
+    std::fs::create_dir_all(&photos).unwrap();
+    let kept = [photos.join("summer.jpg"), site.runs().join("empty")];
+    std::fs::write(&kept[0], "picture").unwrap();
+    std::fs::create_dir(&kept[1]).unwrap();
+    let elsewhere = tempfile::tempdir().unwrap();
+    std::os::unix::fs::symlink(elsewhere.path(), site.runs().join("link")).unwrap();
+    let said = clean(&site, elsewhere.path(), &[]);
+    for name in ["photos", "empty"] {
+        assert!(said.contains(&format!("left {}", site.runs().join(name).display())), "{said}");
+        let output = site.command("cz").args(["run", "--run", name]).output().unwrap();
+        let error = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{error}");
+        assert!(error.contains(".cz-run") && error.contains("--run"), "{error}");
+    }
+    let output = site.command("cz").args(["run", "--run", "link"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2), "{output:?}");
+    assert!(site.command("cz").args(["run", "--run", site.run()]).output().unwrap().status.success());
+    assert!(kept.iter().all(|path| path.exists()), "something of somebody's has been removed");
+    assert!(site.files().is_empty());
+}
+
+#[test]
+fn a_planted_name_in_the_temporary_directory_is_passed_over() {
+    let _alone = ALONE.lock();
+    let site = Site::new("planted");
+    let (temporary, target) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let photo = target.path().join("demo").join("summer.jpg");
+    std::fs::create_dir(photo.parent().unwrap()).unwrap();
+    std::fs::write(&photo, "picture").unwrap();
+    let base = temporary.path().join(format!("cz-{}", rustix::process::getuid().as_raw()));
+    std::os::unix::fs::symlink(target.path(), &base).unwrap();
+    let next = base.with_file_name(format!("{}-1", base.file_name().unwrap().to_str().unwrap()));
+    std::fs::create_dir(&next).unwrap();
+    // As good as another user's: others may write to it.
+    std::fs::set_permissions(&next, PermissionsExt::from_mode(0o777)).unwrap();
+    for arguments in [&["clean"][..], &["run", "--run", "demo"], &["clean"]] {
+        let output = cz_in(&site, temporary.path(), arguments);
+        assert!(output.status.success(), "{arguments:?}: {output:?}");
+        assert!(photo.exists(), "{arguments:?} has removed what a link led to");
+    }
+    let left: Vec<_> = std::fs::read_dir(temporary.path()).unwrap().flatten().map(|e| e.path()).collect();
+    assert_eq!(left.len(), 2, "{left:?}");
+}
+
+#[test]
+fn runs_of_one_name_that_share_nothing_but_shared_memory_do_not_meet() {
+    let _alone = ALONE.lock();
+    let site = Site::new("container");
+    let expected = common::hash(&site.summary(&["corridor-8", "--in-process"]));
+    let (first, parts) = start_long(&site, site.run(), &["--json", "-"]);
+    wait_until("the run to have files", || site.files().len() > 30);
+    stop(&first, &parts);
+    // The same path, and another directory: what a container has that shares /dev/shm alone.
+    let aside = site.runs().with_file_name("aside");
+    std::fs::rename(site.runs(), &aside).unwrap();
+    assert_eq!(common::hash(&site.summary(&["corridor-8"])), expected);
+    assert_eq!(clean(&site, aside.parent().unwrap(), &[]), "nothing to remove\n");
+    std::fs::rename(&aside, site.runs()).unwrap();
+    parts.iter().for_each(|(_, id)| send(*id, Signal::CONT));
+    first.signal(Signal::CONT);
+    assert_eq!(first.ended().hash(), expected);
+    site.assert_clean();
+}
+
+#[test]
+fn files_cut_short_or_written_over_are_cleaned_away_all_the_same() {
+    let _alone = ALONE.lock();
+    for (how, bytes) in [("empty", 0), ("short", 5), ("random", 70_000)] {
+        let site = Site::new(how);
+        let (supervisor, parts) = start_long(&site, site.run(), &[]);
+        wait_until("the run to have files", || site.files().len() > 30);
+        massacre(supervisor, &parts);
+        let noise: Vec<u8> =
+            (0..bytes as u64).map(|i| (i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 56) as u8).collect();
+        let marker = site.runs().join(site.run()).join(".cz-run");
+        for path in site.files().iter().filter(|path| !path.is_dir() && **path != marker) {
+            std::fs::write(path, &noise).unwrap();
+        }
+        let temporary = tempfile::tempdir().unwrap();
+        let mut command = site.command("cz");
+        let mut process = command.env("TMPDIR", temporary.path()).arg("clean").spawn().unwrap();
+        let mut status = None;
+        common::wait_within(std::time::Duration::from_secs(20), "cz clean to end", || {
+            status = process.try_wait().unwrap();
+            status.is_some()
+        });
+        assert!(status.unwrap().success(), "{how}: {status:?}");
+        site.assert_clean();
+    }
+}
+
+#[test]
+fn what_a_killed_run_left_is_swept_when_the_next_one_begins() {
+    let _alone = ALONE.lock();
+    let site = Site::new("sweep");
+    let (supervisor, parts) = start_long(&site, site.run(), &[]);
+    wait_until("the run to have files", || site.files().len() > 10);
+    massacre(supervisor, &parts);
+    assert_ne!(site.files(), Vec::<PathBuf>::new());
+    let other = common::unique_name("other");
+    let ended = site.start_in("cz", &other, &["--set", "end.time_s=5"]).ended();
+    ended.expect(0, &[]);
+    site.assert_clean();
 }

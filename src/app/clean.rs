@@ -26,8 +26,8 @@ pub(super) fn clean(args: &CleanArgs) -> Result<(), AppError> {
         match condition {
             Condition::Dead => {}
             Condition::Alive => kept.push(format!("left {name}: it is active\n")),
-            Condition::Recent => {
-                kept.push(format!("left {name}: it changed a moment ago and may be starting\n"));
+            Condition::Foreign(why) => {
+                kept.extend(paths.iter().map(|path| format!("left {}: {why}\n", path.display())));
             }
         }
     }

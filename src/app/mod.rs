@@ -24,6 +24,7 @@ use crate::process::ProcessError;
 use crate::reproduce::{self, ReproduceError};
 use crate::scenario::ScenarioError;
 use crate::scenario::load::printable;
+use crate::transport::iox::SpaceError;
 use clap::Parser;
 use std::process::ExitCode;
 
@@ -59,9 +60,9 @@ impl From<ProcessError> for AppError {
     fn from(error: ProcessError) -> AppError {
         match error {
             ProcessError::Interrupted { .. } => AppError::Interrupted(error.to_string()),
-            ProcessError::AlreadyActive { .. } | ProcessError::TooFewCores { .. } => {
-                AppError::Usage(error.to_string())
-            }
+            ProcessError::AlreadyActive { .. }
+            | ProcessError::TooFewCores { .. }
+            | ProcessError::Space(SpaceError::NotOurs { .. }) => AppError::Usage(error.to_string()),
             other => AppError::Failed(other.to_string()),
         }
     }

@@ -1,11 +1,13 @@
 """Joining a run and answering its steps."""
 
 import ctypes
+import fcntl
 import os
 import random
+import re
 import shutil
+import stat
 import time
-import zlib
 
 import iceoryx2
 
@@ -15,6 +17,8 @@ from ._view import Partners, ZoneView, as_array
 #: Seconds of polling before sleeping between polls.
 _BUSY_S = 0.002
 _NAP_S = 0.0001
+#: The file in a run's directory by which it is known.
+_MARKER = ".cz-run"
 
 
 class Error(Exception):
@@ -60,12 +64,31 @@ def name_hash(name):
 
 
 def _place(run):
-    """Directory of a run, and prefix of its files (docs/plugin-contract.md)."""
+    """Directory of a run, prefix of its files, and its marker opened; None while it has not been begun
+    (docs/plugin-contract.md)."""
+    uid = os.getuid()
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    base = os.path.join(runtime, "cz") if os.path.isdir(runtime) else os.path.join(_tmp(), f"cz-{os.getuid()}")
+    first = os.path.join(runtime, "cz") if os.path.isdir(runtime) else os.path.join(_tmp(), f"cz-{uid}")
+    for base in [first] + [f"{first}-{i}" for i in range(1, 10)]:
+        try:
+            found = os.lstat(base)
+        except OSError:
+            continue
+        # The first that is a directory of this user, no link, and for nobody else to write.
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == uid and not found.st_mode & 0o022:
+            break
+    else:
+        return None
     directory = os.path.join(base, run)
-    place = zlib.crc32(os.fsencode(directory))
-    return directory, f"cz_{os.getuid()}_{run}_{place:08x}_"
+    try:
+        marker = os.open(os.path.join(directory, _MARKER), os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    except OSError:
+        return None
+    instance = os.read(marker, 9).decode(errors="replace")
+    if not re.fullmatch("[0-9a-f]{8}", instance):
+        os.close(marker)
+        return None
+    return directory, f"cz_{uid}_{run}_{instance}_", marker
 
 
 def _tmp():
@@ -74,8 +97,8 @@ def _tmp():
 
 def _alive(pid):
     try:
-        with open(f"/proc/{pid}/stat") as stat:
-            return stat.read().rsplit(")", 1)[1].split()[0] not in "ZX"
+        with open(f"/proc/{pid}/stat") as line:
+            return line.read().rsplit(")", 1)[1].split()[0] not in "ZX"
     except OSError:
         return False
 
@@ -93,14 +116,16 @@ class Session:
         deadline = time.monotonic() + attach_timeout
         late = Error(f"no world of run {run} answered within {attach_timeout} s")
         iceoryx2.set_log_level(iceoryx2.LogLevel.Fatal)
-        directory, prefix = _place(run)
         # A node in a space nobody has begun would leave a directory behind.
-        while not os.path.isdir(directory):
+        while (place := _place(run)) is None:
             _pause(deadline, late)
+        directory, prefix, self._marker = place
+        # Held until the end: it says that somebody is in the run.
+        fcntl.flock(self._marker, fcntl.LOCK_SH)
         config = iceoryx2.config.default()
         config.global_cfg.root_path = iceoryx2.Path.new(directory)
         config.global_cfg.prefix = iceoryx2.FileName.new(prefix)
-        self._config, self._directory, self._prefix = config, directory, prefix
+        self._directory, self._prefix = directory, prefix
         self._node = (
             iceoryx2.NodeBuilder.new()
             .config(config)
@@ -301,12 +326,25 @@ class Session:
             return
         self._state = self._states = self._coordination = self._commands = None
         self._replies = self._requests = self._node = None
-        if iceoryx2.Node.list(iceoryx2.ServiceType.Ipc, self._config):
-            return
+        try:
+            # Whoever is in the run holds this lock too.
+            fcntl.flock(self._marker, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._remove()
+        except OSError:
+            pass
+        finally:
+            os.close(self._marker)
+
+    def _remove(self):
         for name in os.listdir("/dev/shm"):
             if name.startswith(self._prefix):
                 _forget(os.remove, os.path.join("/dev/shm", name))
-        shutil.rmtree(self._directory, ignore_errors=True)
+        # The marker last, by which the directory is known for a run's.
+        for name in os.listdir(self._directory):
+            if name != _MARKER:
+                shutil.rmtree(os.path.join(self._directory, name), ignore_errors=True)
+        _forget(os.remove, os.path.join(self._directory, _MARKER))
+        _forget(os.rmdir, self._directory)
         # Fails, as it should, while another run has its directory there.
         _forget(os.rmdir, os.path.dirname(self._directory))
 

@@ -3,12 +3,13 @@
 mod bell;
 mod blocks;
 mod leftovers;
+mod place;
 mod ports;
 mod space;
 
 pub use bell::{Bell, BellRope, BellService};
 pub use blocks::{Block, BlockInbox, BlockOutbox};
-pub use leftovers::{Condition, Leftover, clean};
+pub use leftovers::{Condition, Leftover, clean, sweep_dead_runs};
 pub use ports::{IoxFrame, IoxInbox, IoxLoan, IoxOutbox};
 pub use space::{
     AttachDesk, AttachLine, ReplyFrame, RunName, RunNameError, RunSpace, Service, ServiceLimits, SpaceError,

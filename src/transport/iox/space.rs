@@ -1,8 +1,10 @@
 //! The shared-memory space of one run: its node, its services, and their removal.
 //!
-//! A run has a directory of its own and a file-name prefix of its own; both derive from the run's name.
-//! Whoever leaves last removes both, including the one global file iceoryx2 leaves behind.
+//! A run has a directory of its own and a file-name prefix of its own (`place`). Whoever leaves last removes
+//! both, including the one global file iceoryx2 leaves behind.
 
+use super::leftovers::sweep_dead_runs;
+use super::place::{Base, Found, Place, Presence, shared_memory};
 use super::ports::{Factory, IoxInbox, IoxOutbox};
 use crate::transport::TransportError;
 use iceoryx2::config::Config;
@@ -10,14 +12,14 @@ use iceoryx2::port::BackpressureAction;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::{
-    AllocationStrategy, CallbackProgression, LogLevel, Node, NodeBuilder, NodeState, SemanticString,
-    ServiceName, SignalHandlingMode, set_log_level,
+    AllocationStrategy, LogLevel, Node, NodeBuilder, SemanticString, ServiceName, SignalHandlingMode,
+    set_log_level,
 };
 use iceoryx2::sample::Sample;
 use iceoryx2::service::builder::publish_subscribe::{PublishSubscribeCreateError, PublishSubscribeOpenError};
 use iceoryx2::service::ipc;
 use ipc_schemas::{AttachReply, AttachRequest, FrameHeader, Record, SERVICE_ATTACH, SERVICE_ATTACH_REPLY};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::rc::Rc;
 use std::str::FromStr;
 
@@ -71,6 +73,14 @@ pub enum SpaceError {
         service: String,
         /// What iceoryx2 said.
         reason: String,
+    },
+    /// A file or directory that is to be used is not ours.
+    #[error("cannot use {}: {problem}", .path.display())]
+    NotOurs {
+        /// Which.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
     },
     /// iceoryx2 or the file system failed.
     #[error("{what}: {reason}")]
@@ -136,9 +146,8 @@ impl<R: Record> Service<R> {
 pub struct RunSpace {
     // Declared first so that it is dropped before the files are swept.
     node: Option<Node<ipc::Service>>,
-    config: Config,
+    presence: Option<Presence>,
     run: RunName,
-    directory: PathBuf,
 }
 
 /// Frames in flight per connection: in lockstep one is being read while the next arrives.
@@ -148,23 +157,35 @@ const BUFFER: usize = 2;
 const BORROWED: usize = 4;
 
 impl RunSpace {
-    /// Enters the space of a run, creating it when nobody else has.
+    /// Enters the space of a run, creating it when nobody else has. Whoever creates one removes what dead runs
+    /// have left, whatever their names.
     pub fn enter(run: &RunName) -> Result<RunSpace, SpaceError> {
         // Everything iceoryx2 reports comes back as an error value, which says it better.
         set_log_level(LogLevel::Fatal);
-        let base = base_directory();
-        let directory = base.join(run.to_string());
-        private_directory(&base)?;
-        private_directory(&directory)?;
-        let config = config(run, &directory)?;
+        // Locked until there is a node, so that nobody who leaves takes the directory away meanwhile.
+        let Some(base) = Base::open(true)? else { unreachable!("a missing one is made") };
+        let (place, begins) = match base.find(run) {
+            Found::Run(place) if !place.is_dead() => (place, false),
+            Found::Run(dead) => {
+                base.remove(&dead);
+                (base.begin(run)?, true)
+            }
+            Found::Nothing => (base.begin(run)?, true),
+            Found::Foreign(problem) => return Err(foreign(&base, run, &problem)),
+        };
+        let presence = Some(place.enter()?);
         let node = NodeBuilder::new()
-            .config(&config)
+            .config(&config(&place)?)
             .signal_handling_mode(SignalHandlingMode::Disabled)
             .create::<ipc::Service>()
             .map_err(|e| failed("create a node", &e))?;
-        close_to_others(&prefix(run, &directory));
+        close_to_others(&place.prefix);
         node.try_cleanup_dead_nodes();
-        Ok(RunSpace { node: Some(node), config, run: run.clone(), directory })
+        drop(base);
+        if begins {
+            sweep_dead_runs();
+        }
+        Ok(RunSpace { node: Some(node), presence, run: run.clone() })
     }
 
     pub(super) fn node(&self) -> &Node<ipc::Service> {
@@ -281,111 +302,50 @@ impl RunSpace {
     /// Removes everything a run has left when none of its processes lives any more; does nothing
     /// otherwise. Returns whether the space is now empty.
     pub fn sweep(run: &RunName) -> Result<bool, SpaceError> {
-        set_log_level(LogLevel::Fatal);
-        let directory = base_directory().join(run.to_string());
-        if !directory.exists() {
-            remove_base(&directory);
-            return Ok(true);
+        let Some(base) = Base::open(false)? else { return Ok(true) };
+        match base.find(run) {
+            Found::Nothing => {}
+            Found::Run(place) if place.is_dead() => base.remove(&place),
+            Found::Run(_) => return Ok(false),
+            Found::Foreign(problem) => return Err(foreign(&base, run, &problem)),
         }
-        let config = config(run, &directory)?;
-        Ok(sweep(&config, run, &directory))
+        base.remove_if_empty();
+        Ok(true)
     }
 }
 
 impl Drop for RunSpace {
     fn drop(&mut self) {
         drop(self.node.take());
-        sweep(&self.config, &self.run, &self.directory);
+        drop(self.presence.take());
+        // What cannot be removed now is removed by the next who looks.
+        let _ = RunSpace::sweep(&self.run);
     }
 }
 
-/// Removes the run's files unless a process of it is still alive. Two processes that leave at the same
-/// time may both find nobody else and both remove; neither minds a file that is gone already.
-fn sweep(config: &Config, run: &RunName, directory: &Path) -> bool {
-    let mut alive = false;
-    let listed = Node::<ipc::Service>::list(config, |state| {
-        match state {
-            NodeState::Dead(view) => {
-                let _ = view.try_remove_stale_resources();
-            }
-            NodeState::Alive(_) | NodeState::Inaccessible(_) => alive = true,
-            NodeState::Undefined(_) => {}
-        }
-        CallbackProgression::Continue
-    });
-    if alive || listed.is_err() {
-        return false;
-    }
-    let prefix = prefix(run, directory);
-    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-        if entry.file_name().to_string_lossy().starts_with(&prefix) {
-            let _ = std::fs::remove_file(entry.path());
-        }
-    }
-    let _ = std::fs::remove_dir_all(directory);
-    remove_base(directory);
-    true
-}
-
-/// Removes the directory of all runs; fails, as it should, while another run has its own in it.
-fn remove_base(directory: &Path) {
-    if let Some(base) = directory.parent() {
-        let _ = std::fs::remove_dir(base);
-    }
+fn foreign(base: &Base, run: &RunName, problem: &str) -> SpaceError {
+    let problem = format!("{problem}; choose another name with --run");
+    SpaceError::NotOurs { path: base.path.join(run.to_string()), problem }
 }
 
 /// Takes from other users what iceoryx2 lets them have: it creates one file per prefix, a counter of nodes,
 /// for everybody to write. All others it creates for this user alone.
 fn close_to_others(prefix: &str) {
     use std::os::unix::fs::PermissionsExt;
-    for entry in std::fs::read_dir("/dev/shm").into_iter().flatten().flatten() {
-        let name = entry.file_name();
-        let name = name.to_string_lossy();
-        if name.starts_with(prefix) && name.ends_with(".global_mgmt") {
-            // It belongs to this user, or is gone already with the last process of a former run.
-            let _ = std::fs::set_permissions(entry.path(), std::fs::Permissions::from_mode(0o600));
+    for path in shared_memory(prefix) {
+        if path.extension().is_some_and(|extension| extension == "global_mgmt") {
+            let _ = std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600));
         }
     }
 }
 
-/// File-name prefix of a run's shared memory. The directory's hash in it keeps apart runs of one name in
-/// different runtime directories, which do not see each other's nodes and would otherwise sweep each
-/// other's memory; the fixed length of the hash keeps a run `a` from matching the files of a run `a-b`.
-pub(super) fn prefix(run: &RunName, directory: &Path) -> String {
-    let place = crc32fast::hash(directory.as_os_str().as_encoded_bytes());
-    format!("cz_{}_{run}_{place:08x}_", rustix::process::getuid().as_raw())
-}
-
-/// The directory under which each run has its own: in the user's runtime directory where there is one.
-pub(super) fn base_directory() -> PathBuf {
-    match std::env::var_os("XDG_RUNTIME_DIR") {
-        Some(runtime) if Path::new(&runtime).is_dir() => PathBuf::from(runtime).join("cz"),
-        _ => std::env::temp_dir().join(format!("cz-{}", rustix::process::getuid().as_raw())),
-    }
-}
-
-fn private_directory(path: &Path) -> Result<(), SpaceError> {
-    use std::os::unix::fs::{DirBuilderExt, MetadataExt};
-    std::fs::DirBuilder::new()
-        .recursive(true)
-        .mode(0o700)
-        .create(path)
-        .map_err(|e| failed(&format!("create {}", path.display()), &e))?;
-    let owner = std::fs::metadata(path).map_err(|e| failed(&format!("read {}", path.display()), &e))?.uid();
-    if owner == rustix::process::getuid().as_raw() {
-        Ok(())
-    } else {
-        Err(failed(&format!("use {}", path.display()), &format!("it belongs to user {owner}")))
-    }
-}
-
-pub(super) fn config(run: &RunName, directory: &Path) -> Result<Config, SpaceError> {
+fn config(place: &Place) -> Result<Config, SpaceError> {
     let mut config = Config::default();
-    let path = directory.to_string_lossy();
+    let path = place.directory.to_string_lossy();
     let path = iceoryx2::prelude::Path::new(path.as_bytes())
         .map_err(|e| failed(&format!("use the directory {path}"), &e))?;
     config.global.set_root_path(&path);
-    config.global.prefix = iceoryx2::prelude::FileName::new(prefix(run, directory).as_bytes())
+    config.global.prefix = iceoryx2::prelude::FileName::new(place.prefix.as_bytes())
         .map_err(|e| failed("form a file-name prefix", &e))?;
     Ok(config)
 }
