@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{LONG_RUN, Process, Site, children, is_alive, part, send, ticks, wait_until};
+use common::{LONG_RUN, Process, Site, children, is_alive, part, send, wait_until};
 use control_zones::record::{Reader, Writer};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -46,13 +46,14 @@ fn cut_short(times: usize, victim: &str, shares: &[&str], processes: usize) {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
     let reference = Site::new("u");
     let expected = in_process(&reference, &LONG_RUN);
-    let directory = tempfile::tempdir().unwrap();
     let mut steps = Vec::new();
     while steps.len() < times {
+        let directory = tempfile::tempdir().unwrap();
         let (site, file) = (Site::new("cut"), file(&directory));
         let (supervisor, parts) = begin(&site, &[&LONG_RUN[..], shares].concat(), &file, processes);
         let world = part(&parts, "world");
-        wait_until("the world to be stepping", || ticks(world) >= 3 || !is_alive(world));
+        // Before its first step there is nothing to go on from.
+        wait_until("the world to be stepping", || file.exists() || !is_alive(world));
         std::thread::sleep(Duration::from_millis(rng.random_range(0..150)));
         let id = if victim == "supervisor" { supervisor.id() } else { world };
         if is_alive(id) {

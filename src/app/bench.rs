@@ -85,6 +85,7 @@ fn run_processes(
             wait_mode: WaitMode::Hybrid,
             restart: if record.is_some() { Restart::OnFailure } else { Restart::Never },
             timing: TimingArgs::default(),
+            record_lag: None,
         },
         run_id: new_run_id(),
         resume: None,

@@ -4,7 +4,7 @@ use super::args::{PartArgs, Restart, WaitArgs, WorldArgs};
 use super::lines::{PartLine, WorldLine};
 use super::record::Recording;
 use super::report::{Summary, Transport};
-use super::{AppError, record};
+use super::{AppError, record, report};
 use crate::lockstep::RefusedFrames;
 use crate::process::{
     Joining, Observation, Settled, Settling, StopFlag, WorldOptions, first_missing_step, new_run_id,
@@ -30,14 +30,19 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     let stop = StopFlag::from_signals()?;
     follow_supervisor(args.supervised)?;
     let run_id = args.run_id.unwrap_or_else(new_run_id);
+    let past = resume
+        .as_ref()
+        .map(|reader| (reader, args.resume_steps.unwrap_or_else(|| first_missing_step(reader))));
+    report::check_json(args.json.as_deref())?;
     let observation = match &args.record {
         Some(path) => {
-            let recording = match (&resume, &args.resume) {
-                (Some(reader), Some(from)) => {
-                    Recording::continuation(path, reader, from, first_missing_step(reader), run_id)?
+            let recording = match (past, &args.resume) {
+                (Some((reader, steps)), Some(from)) => {
+                    Recording::continuation(path, reader, from, steps, run_id)?
                 }
                 _ => Recording::start(path, &args.scenario, &scenario, share, run_id)?,
             };
+            let recording = recording.lagging(args.conduct.record_lag());
             let push = |r: &mut Recording, step, block: &[u8]| r.push_block(step, block);
             Some(Observation::start(args.run.clone(), recording, push))
         }
@@ -53,13 +58,14 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         replace: args.conduct.restart == Restart::OnFailure,
         timing: args.conduct.timing.timing()?,
         observed: args.observed || observation.is_some(),
+        record_lag: args.conduct.record_lag(),
         run_id: Some(run_id),
     };
     let report = report_to(args.supervised, &args.conduct.wait);
     let settling = settling(&args.conduct.wait, &*report);
     if args.supervised.is_some() {
         let mut last = Instant::now();
-        let outcome = run_world(&scenario, &options, resume.as_ref(), &settling, &stop, |world| {
+        let outcome = run_world(&scenario, &options, past, &settling, &stop, |world| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
                 say(&WorldLine::progress(world));
@@ -68,10 +74,13 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         say(&WorldLine::Outcome(Box::new(outcome)));
         return Ok(());
     }
-    let outcome = run_world(&scenario, &options, resume.as_ref(), &settling, &stop, |_: &World| {});
+    let outcome = run_world(&scenario, &options, past, &settling, &stop, |_: &World| {});
     let outcome = outcome.map_err(AppError::from);
     let recorded = match observation {
-        Some(observation) => observation.stop()?.finish(&outcome),
+        Some(observation) => match observation.stop() {
+            Ok(recording) => recording.finish(&outcome),
+            Err(error) => Err(error.into()),
+        },
         None => Ok(()),
     };
     let outcome = outcome?;

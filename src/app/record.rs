@@ -3,6 +3,7 @@
 use super::args::{ReplayArgs, ScenarioArgs, ShareArgs, VerifyArgs};
 use super::show::number;
 use super::{AppError, print};
+use crate::process::RecordLag;
 use crate::record::{
     Build, FileSource, Flaw, Metadata, Processes, Reader, RecordError, Recorder, Replay, RunEnd,
     ScenarioSource, StepFrames, Stop, compare, replay as replay_roles,
@@ -16,9 +17,10 @@ use std::path::{Path, PathBuf};
 impl From<RecordError> for AppError {
     fn from(error: RecordError) -> AppError {
         match error {
-            RecordError::Occupied(_) | RecordError::Create { .. } => {
-                AppError::Usage(format!("--record: {error}"))
-            }
+            RecordError::Occupied(_)
+            | RecordError::Busy(_)
+            | RecordError::TooLarge { .. }
+            | RecordError::Create { .. } => AppError::Usage(format!("--record: {error}")),
             RecordError::Write { .. } => AppError::Failed(error.to_string()),
         }
     }
@@ -28,6 +30,10 @@ impl From<RecordError> for AppError {
 pub(super) struct Recording {
     recorder: Recorder,
     path: PathBuf,
+    /// What becomes of steps that come faster than they can be written.
+    lag: RecordLag,
+    /// Why nothing is written any more.
+    failure: Option<RecordError>,
 }
 
 impl Recording {
@@ -48,7 +54,16 @@ impl Recording {
         let controllers = scenario.controllers(share.ctrl_procs);
         let processes = Processes { coordinators: share.coord_procs, controllers };
         let metadata = Metadata::new(scenario, source, run_id, processes);
-        Ok(Recording { recorder: Recorder::create(path, &metadata)?, path: path.to_owned() })
+        Ok(Recording::of(Recorder::create(path, &metadata)?, path))
+    }
+
+    fn of(recorder: Recorder, path: &Path) -> Recording {
+        Recording { recorder, path: path.to_owned(), lag: RecordLag::Wait, failure: None }
+    }
+
+    /// Has steps left out, or waited for, that come faster than they can be written.
+    pub fn lagging(self, lag: RecordLag) -> Recording {
+        Recording { lag, ..self }
     }
 
     /// Starts the recording of a run that goes on from another recording: its first `steps` steps are the past
@@ -73,17 +88,34 @@ impl Recording {
                 break; // it has failed, and says so at the end
             }
         }
-        Ok(Recording { recorder, path: path.to_owned() })
+        Ok(Recording::of(recorder, path))
     }
 
-    /// Records a step of a run in this process, which may wait for the disk. A failure is told of at the end.
+    /// Records a step of a run in this process, which may wait for the disk.
     pub fn push(&mut self, frames: &StepFrames<'_>) {
-        self.recorder.push_or_wait(frames);
+        if self.failure.is_none() && !self.recorder.push_or_wait(frames) {
+            self.note_failure();
+        }
     }
 
-    /// Records the block of a step of a run in other processes; never waits.
+    /// Records the block of a step of a run in other processes.
     pub fn push_block(&mut self, step: u64, block: &[u8]) {
-        self.recorder.push_block(step, block);
+        let pushed = match self.lag {
+            _ if self.failure.is_some() => return,
+            RecordLag::Drop => self.recorder.push_block(step, block),
+            RecordLag::Wait => self.recorder.push_block_or_wait(step, block),
+        };
+        if !pushed {
+            self.note_failure();
+        }
+    }
+
+    /// Says at once that nothing is written any more; the run goes on all the same, and ends with it.
+    fn note_failure(&mut self) {
+        self.failure = self.recorder.failure();
+        if let Some(error) = &self.failure {
+            eprintln!("cz: {error}; the run goes on without being recorded");
+        }
     }
 
     /// Ends the recording and says on stderr what is in it.
@@ -93,7 +125,15 @@ impl Recording {
             Err(AppError::Interrupted(_)) => RunEnd::Interrupted,
             Err(error) => RunEnd::Failed { reason: error.to_string() },
         };
-        let recorded = self.recorder.finish(end)?;
+        let recorded = self.recorder.finish(end);
+        if let Some(error) = self.failure {
+            return Err(error.into());
+        }
+        let recorded = recorded?;
+        if recorded.steps == 0 {
+            eprintln!("recorded nothing: {} is as it was", self.path.display());
+            return Ok(());
+        }
         let (path, size) = (self.path.display(), bytes(recorded.bytes));
         eprintln!("recorded {} in {path} ({size})", number(recorded.steps, "step"));
         if !recorded.missing.is_empty() {
@@ -104,6 +144,21 @@ impl Recording {
             );
         }
         Ok(())
+    }
+}
+
+/// Ends the recording of a run that was to be recorded into this file.
+pub(super) fn finish<T>(
+    recording: Option<Recording>,
+    path: Option<&Path>,
+    outcome: &Result<T, AppError>,
+) -> Result<(), AppError> {
+    match (recording, path) {
+        (Some(recording), _) => recording.finish(outcome),
+        (None, Some(path)) => {
+            Err(AppError::Failed(format!("the run is not in {} to its end", path.display())))
+        }
+        (None, None) => Ok(()),
     }
 }
 

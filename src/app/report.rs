@@ -42,6 +42,18 @@ pub(super) struct Summary {
     show_placement: bool,
 }
 
+/// Refuses a file for the JSON that cannot be written, before there is anything to write.
+pub(super) fn check_json(path: Option<&Path>) -> Result<(), AppError> {
+    let Some(path) = path.filter(|path| *path != Path::new("-")) else { return Ok(()) };
+    let existed = path.symlink_metadata().is_ok();
+    let opened = std::fs::OpenOptions::new().append(true).create(true).open(path);
+    opened.map_err(|e| AppError::Usage(format!("--json: cannot write {}: {e}", path.display())))?;
+    if !existed {
+        let _ = std::fs::remove_file(path);
+    }
+    Ok(())
+}
+
 /// How the frames of a run travelled.
 #[derive(Clone, Copy, Debug)]
 pub(super) enum Transport {
@@ -96,9 +108,11 @@ impl Summary {
         if path == Path::new("-") {
             return print(&text);
         }
+        // The table first: it is all there is when the file cannot be written.
+        let printed = print(&self.table());
         std::fs::write(path, text)
             .map_err(|e| AppError::Failed(format!("cannot write {}: {e}", path.display())))?;
-        print(&self.table())
+        printed
     }
 
     fn table(&self) -> String {

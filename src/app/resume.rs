@@ -5,9 +5,9 @@ use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::run::{Bar, own_name};
 use super::supervise::{Plan, supervise};
-use super::{AppError, print, record};
+use super::{AppError, print, record, report};
 use crate::process::{RestoreError, StopFlag, first_missing_step, new_run_id, restore, run_on_in_process};
-use crate::record::{FileSource, Reader};
+use crate::record::{FileSource, Reader, is_growing};
 use crate::scenario::{Override, Scenario, load_recorded};
 use crate::world::{World, WorldSummary};
 use comfy_table::{Cell, CellAlignment, Table, presets};
@@ -25,6 +25,11 @@ impl From<RestoreError> for AppError {
 }
 
 pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
+    report::check_json(args.supervised.json.as_deref())?;
+    if is_growing(&args.file).unwrap_or(false) {
+        let problem = "a run is still recording into it; expected the recording of a run that has ended";
+        return Err(AppError::Usage(format!("{}: {problem}", args.file.display())));
+    }
     let reader = record::open(&args.file)?;
     let scenario = reader.scenario().clone();
     let first = first_missing_step(&reader);
@@ -45,16 +50,19 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         share,
         conduct: args.supervised.conduct,
         run_id: new_run_id(),
-        resume: Some(&args.file),
+        resume: Some((&args.file, first)),
     };
+    let lag = args.supervised.conduct.record_lag();
     let recording = match &args.record {
-        Some(path) => Some(Recording::continuation(path, &reader, &args.file, first, plan.run_id)?),
+        Some(path) => {
+            Some(Recording::continuation(path, &reader, &args.file, first, plan.run_id)?.lagging(lag))
+        }
         None => None,
     };
     let bar = Bar::new(&scenario);
     let (outcome, recording) = supervise(&plan, recording, |position| bar.show(position));
     bar.finish();
-    let recorded = recording.map_or(Ok(()), |recording| recording.finish(&outcome));
+    let recorded = record::finish(recording, args.record.as_deref(), &outcome);
     let processes = 1 + share.coord_procs + scenario.controllers(share.ctrl_procs);
     let asked = args.supervised.conduct.wait.asks_for_placement();
     let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome?);

@@ -4,7 +4,7 @@ use super::args::RunArgs;
 use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::supervise::{self, Plan};
-use super::{AppError, controllers};
+use super::{AppError, controllers, record, report};
 use crate::lockstep::in_process::InProcess;
 use crate::process::{StopFlag, WaitMode, check_cores, new_run_id, run_in_process, run_in_process_observed};
 use crate::scenario::Scenario;
@@ -27,6 +27,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         return Err(AppError::Usage(problem.to_owned()));
     }
     args.supervised.conduct.timing.timing()?;
+    report::check_json(args.supervised.json.as_deref())?;
     if args.in_process && args.supervised.conduct.timing.is_given() {
         let problem =
             "--in-process: nobody else can be late; --pace and --deadline are for several processes";
@@ -69,14 +70,15 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
             resume: None,
         };
         let recording = match &args.record {
-            Some(path) => Some(Recording::start(path, &arguments, &scenario, args.share, plan.run_id)?),
+            Some(path) => {
+                let recording = Recording::start(path, &arguments, &scenario, args.share, plan.run_id)?;
+                Some(recording.lagging(args.supervised.conduct.record_lag()))
+            }
             None => None,
         };
         let (outcome, recording) = supervise::supervise(&plan, recording, |position| bar.show(position));
         bar.finish();
-        if let Some(recording) = recording {
-            recorded = recording.finish(&outcome);
-        }
+        recorded = record::finish(recording, args.record.as_deref(), &outcome);
         (Transport::Iceoryx2 { processes }, outcome)
     };
     bar.finish();

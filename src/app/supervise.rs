@@ -31,8 +31,8 @@ pub(super) struct Plan<'a> {
     pub conduct: ConductArgs,
     /// Id of the run.
     pub run_id: u64,
-    /// The recording the run goes on from.
-    pub resume: Option<&'a Path>,
+    /// The recording the run goes on from, and so many of its steps.
+    pub resume: Option<(&'a Path, u64)>,
 }
 
 /// A part that dies this often, each time soon after it was started, is given up.
@@ -174,7 +174,8 @@ impl Family {
         world.extend(["--run-id".to_owned(), plan.run_id.to_string()]);
         world.extend(observed.then(|| "--observed".to_owned()));
         world.extend(plan.scenario.to_arguments());
-        let resume = plan.resume.map(|path| {
+        world.extend(plan.resume.map(|(_, steps)| format!("--resume-steps={steps}")));
+        let resume = plan.resume.map(|(path, _)| {
             let mut argument = OsString::from("--resume=");
             argument.push(path);
             argument

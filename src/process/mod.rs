@@ -19,7 +19,7 @@ mod wait;
 mod world;
 
 pub use attach::{Attachment, Joining};
-pub use observe::Observation;
+pub use observe::{Observation, RecordLag};
 pub use outcome::{LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, new_histogram};
 pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
 pub use participant::{run_controller, run_coordinator};

@@ -1,6 +1,6 @@
 //! Looking on: the steps of a run, as blocks of bytes, for whoever records them.
 
-use super::ProcessError;
+use super::{ProcessError, StopFlag};
 use crate::lockstep::Observer;
 use crate::scenario::Scenario;
 use crate::step::{Step, StepFrames};
@@ -10,15 +10,55 @@ use ipc_schemas::{Assignment, SERVICE_OBSERVER, VehicleCommand, VehicleState};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
+
+/// What becomes of a step that the recorder cannot take yet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum RecordLag {
+    /// It is left out of the recording, which says so; the run keeps its time.
+    Drop,
+    /// The run waits; the recording is whole.
+    Wait,
+}
 
 /// The world's side: publishes each step.
 #[derive(Debug)]
-pub(super) struct ObservedSteps(pub BlockOutbox);
+pub(super) struct ObservedSteps {
+    pub outbox: BlockOutbox,
+    lag: RecordLag,
+    /// How long a step may wait to be taken.
+    patience: Duration,
+    stop: StopFlag,
+    /// Nothing follows what was lost, so that what was recorded has no gap.
+    ended: bool,
+}
+
+/// Time between two tries to hand on a step that is to wait.
+const RETRY: Duration = Duration::from_micros(100);
 
 impl Observer for ObservedSteps {
     fn observe(&mut self, frames: &StepFrames<'_>) -> Result<(), TransportError> {
-        self.0.send(frames.encoded_len(), |write| frames.encode(write))
+        let length = frames.encoded_len();
+        let mut since = None;
+        while !self.ended {
+            let taken = self.outbox.send(length, |write| frames.encode(write))?;
+            if taken || self.lag == RecordLag::Drop {
+                break;
+            }
+            let waited = since.get_or_insert_with(Instant::now).elapsed();
+            // Whoever recorded has gone, or the run is to end.
+            self.ended = !self.outbox.has_reader() || self.stop.is_set();
+            if waited >= self.patience {
+                let seconds = self.patience.as_secs_f64();
+                let reason = format!(
+                    "whoever records the run has taken no step for {seconds} s; --record-lag drop leaves out what it \
+                     cannot take"
+                );
+                return Err(TransportError::Failed { service: SERVICE_OBSERVER.to_owned(), reason });
+            }
+            std::thread::sleep(RETRY);
+        }
+        Ok(())
     }
 }
 
@@ -33,11 +73,14 @@ pub(super) fn create(
     space: &RunSpace,
     vehicles: usize,
     scenario: &Scenario,
+    (lag, patience): (RecordLag, Duration),
+    stop: &StopFlag,
 ) -> Result<ObservedSteps, SpaceError> {
     let per_vehicle = size_of::<VehicleState>() + size_of::<VehicleCommand>() + 2 * size_of::<Assignment>();
     let expected = vehicles * per_vehicle + 64 * scenario.network.zones.len() + 1024;
     let waiting = (WAITING_BYTES / expected).clamp(FEWEST_WAITING, MOST_WAITING);
-    space.create_blocks(SERVICE_OBSERVER, expected, waiting).map(ObservedSteps)
+    let outbox = space.create_blocks(SERVICE_OBSERVER, expected, waiting, lag == RecordLag::Drop)?;
+    Ok(ObservedSteps { outbox, lag, patience, stop: stop.clone(), ended: false })
 }
 
 /// A thread that takes the steps of a run.

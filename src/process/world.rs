@@ -7,7 +7,7 @@ use super::outcome::{History, Outcome, StepMeter};
 use super::pace::Pacer;
 use super::placement::number_of_cores;
 use super::services::{Services, create_bells, expected_vehicles};
-use super::{Pace, Patience, Peer, ProcessError, Settling, StopFlag, Timing, WaitMode, Waiter};
+use super::{Pace, Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Handover, Ledger, Progress, Seat, WorldDriver};
 use crate::record::{FileSource, Reader, ReplayError, replay_world};
@@ -41,6 +41,8 @@ pub struct WorldOptions {
     pub timing: Timing,
     /// Whether the run is looked on; it begins once somebody does.
     pub observed: bool,
+    /// What becomes of steps that whoever looks on cannot take yet.
+    pub record_lag: RecordLag,
     /// The run's id, where it has been chosen already.
     pub run_id: Option<u64>,
 }
@@ -77,18 +79,19 @@ pub fn new_run_id() -> u64 {
     u64::from_le_bytes(id)
 }
 
-/// Runs the world of a multi-process run to its end; `progress` is called now and then.
+/// Runs the world of a multi-process run to its end, on from so many steps of a recording if there is one;
+/// `progress` is called now and then.
 pub fn run_world(
     scenario: &Arc<Scenario>,
     options: &WorldOptions,
-    resume: Option<&Reader<FileSource>>,
+    resume: Option<(&Reader<FileSource>, u64)>,
     settling: &Settling<'_>,
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
     // First of all: it may take a while, and may fail.
     let world = match resume {
-        Some(reader) => replay_world(reader, first_missing_step(reader))?,
+        Some((reader, steps)) => replay_world(reader, steps)?,
         None => World::new(scenario.clone(), options.coordinators),
     };
     let first_step = world.step();
@@ -96,7 +99,7 @@ pub fn run_world(
         (options.keeps() || resume.is_some()).then(|| Ledger::new(scenario, options.controllers));
     let mut missed = false;
     // Behind these the file may be cut off.
-    for step in resume.iter().flat_map(|reader| reader.steps().take(first_step as usize)) {
+    for step in resume.iter().flat_map(|(reader, _)| reader.steps().take(first_step as usize)) {
         let step = step.map_err(ReplayError::from)?;
         ledger.iter_mut().for_each(|ledger| ledger.relive(&step));
         missed = step.misses != 0;
@@ -116,7 +119,11 @@ pub fn run_world(
     let services =
         Services::create(&space, scenario, (coordinators, controllers), ledger.is_some()).map_err(active)?;
     let observed = match options.observed {
-        true => Some(observe::create(&space, expected_vehicles(scenario), scenario).map_err(active)?),
+        true => {
+            // Less than others wait for the world, so that it is the world that says what it waited for.
+            let lag = (options.record_lag, options.peer_timeout.mul_f64(0.9));
+            Some(observe::create(&space, expected_vehicles(scenario), scenario, lag, stop).map_err(active)?)
+        }
         false => None,
     };
     let _bells = create_bells(&space, wait, coordinators, controllers)?;
@@ -269,7 +276,7 @@ fn receive_all(
             None => Readiness::Begin,
         })?;
         let missing = reception.first_missing();
-        let is_looked_on = observed.is_none_or(|steps| steps.0.has_reader());
+        let is_looked_on = observed.is_none_or(|steps| steps.outbox.has_reader());
         if missing.is_none() && is_looked_on {
             return Ok(());
         }

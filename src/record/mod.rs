@@ -5,6 +5,7 @@
 
 mod block;
 mod compare;
+mod file;
 mod format;
 mod reader;
 mod recorder;
@@ -16,6 +17,7 @@ mod writer;
 pub use crate::step::{CommandPart, Commands, Step, StepFrames};
 pub use block::BlockFault;
 pub use compare::{Comparison, Difference, Section, compare};
+pub use file::is_growing;
 pub use format::{Build, Footer, Metadata, Processes, RunEnd, ScenarioSource};
 pub use reader::{Damage, FileSource, Flaw, OpenError, Reader, Source, Steps};
 pub use recorder::{Output, QueueLimits, RecordError, Recorded, Recorder, steps_in};

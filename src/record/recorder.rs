@@ -1,16 +1,16 @@
-//! The recorder: a thread that writes what it is handed, so that a run never waits for a disk.
+//! The recorder: a thread that writes what it is handed, so that a run never waits for a disk unless it wants to.
 //!
-//! Blocks wait in a bounded queue. When it is full a step is not recorded, and that is remembered: in the
-//! footer, and for whoever asks at the end. What has been written is handed to the system every 100 ms, so a
-//! program that is killed loses no more than that; at the end it is forced onto the disk.
+//! Blocks wait in a bounded queue. When it is full, whoever hands one over waits, or leaves the step out, and that
+//! is remembered: in the footer, and for whoever asks at the end. What has been written is handed to the system
+//! every 100 ms, so a program that is killed loses no more than that; at the end it is forced onto the disk.
+//! Nothing is made before there is a step to write (`file`).
 
-use super::format::{FILE_MAGIC, Metadata, RunEnd};
+use super::file::{RecordingFile, probe};
+use super::format::{Metadata, RunEnd};
 use super::writer::{WriteError, Writer};
 use crate::step::{Step, StepFrames};
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
-use std::fs::{File, OpenOptions};
-use std::io::{self, BufWriter, Read, Write};
-use std::os::unix::fs::OpenOptionsExt;
+use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -42,11 +42,15 @@ impl Default for QueueLimits {
 pub trait Output: Write + Send + 'static {
     /// Makes what has been written outlast a power cut.
     fn sync(&mut self) -> io::Result<()>;
-}
 
-impl Output for File {
-    fn sync(&mut self) -> io::Result<()> {
-        self.sync_all()
+    /// The first step has been written: whoever looks for the recording is to find it.
+    fn appear(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+
+    /// Whether what is written can still be found.
+    fn check(&mut self) -> io::Result<()> {
+        Ok(())
     }
 }
 
@@ -56,6 +60,19 @@ pub enum RecordError {
     /// There is a file of that name which is no recording.
     #[error("{} exists and is not a recording; it is left as it is", .0.display())]
     Occupied(PathBuf),
+    /// Another run records into the file.
+    #[error("another run is recording into {}", .0.display())]
+    Busy(PathBuf),
+    /// The scenario is larger than anybody reads.
+    #[error("cannot create {}: the scenario takes {found} bytes, expected at most {limit}: its traces are too long", .path.display())]
+    TooLarge {
+        /// Path as given.
+        path: PathBuf,
+        /// Bytes of the metadata.
+        found: usize,
+        /// What a reader takes.
+        limit: usize,
+    },
     /// The file cannot be created.
     #[error("cannot create {}: {source}", .path.display())]
     Create {
@@ -114,7 +131,8 @@ pub struct Recorder {
     spare: Option<Vec<u8>>,
     waiting_bytes: Arc<AtomicUsize>,
     limits: QueueLimits,
-    thread: JoinHandle<Result<Recorded, RecordError>>,
+    /// Until its failure has been taken.
+    thread: Option<JoinHandle<Result<Recorded, RecordError>>>,
     next: u64,
     /// Steps that could not be let in so far, and those that were never pushed between two that were.
     missing: Vec<(u64, u64)>,
@@ -122,19 +140,29 @@ pub struct Recorder {
 
 impl Recorder {
     /// Starts a recording in a new file, which only its owner can read. A recording of that name is
-    /// replaced, any other file is refused: a mistyped name costs nobody a file.
+    /// replaced once the first step has been written, any other file is refused: a mistyped name costs nobody a
+    /// file, a run that does not begin nobody a recording. That the file can be written is tried here.
     pub fn create(path: &Path, metadata: &Metadata) -> Result<Recorder, RecordError> {
-        let file = create(path)?;
-        Ok(Recorder::over(file, metadata.clone(), QueueLimits::default()))
+        probe(path, metadata)?;
+        let path = path.to_owned();
+        Ok(Recorder::start(move || RecordingFile::begin(path), metadata.clone(), QueueLimits::default()))
     }
 
     /// Starts a recording to anything.
     pub fn over(out: impl Output, metadata: Metadata, limits: QueueLimits) -> Recorder {
+        Recorder::start(move || Ok(out), metadata, limits)
+    }
+
+    fn start<W: Output>(
+        open: impl FnOnce() -> io::Result<W> + Send + 'static,
+        metadata: Metadata,
+        limits: QueueLimits,
+    ) -> Recorder {
         let (queue, inbox) = bounded(limits.steps.max(1));
         let (done, spares) = bounded(limits.steps.max(1) + 1);
         let waiting_bytes = Arc::new(AtomicUsize::new(0));
         let waiting = waiting_bytes.clone();
-        let thread = std::thread::spawn(move || write(out, &metadata, &inbox, &done, &waiting));
+        let thread = Some(std::thread::spawn(move || write(open, &metadata, &inbox, &done, &waiting)));
         Recorder { queue, spares, spare: None, waiting_bytes, limits, thread, next: 0, missing: Vec::new() }
     }
 
@@ -153,7 +181,7 @@ impl Recorder {
 
     fn enqueue_or_wait(&mut self, step: u64, block: Vec<u8>) -> bool {
         let length = block.len();
-        while !self.has_room(length) && !self.thread.is_finished() {
+        while !self.has_room(length) && !self.has_ended() {
             // Bytes are the tighter limit only for steps so large that writing one takes milliseconds.
             std::thread::sleep(Duration::from_millis(1));
         }
@@ -173,12 +201,36 @@ impl Recorder {
         self.enqueue(step, block)
     }
 
-    /// Writes what waits, then the end. Waits for the disk.
+    /// The same, and waits while the queue is full; `false` when the recorder has failed.
+    pub fn push_block_or_wait(&mut self, step: u64, bytes: &[u8]) -> bool {
+        let mut block = self.buffer();
+        block.extend_from_slice(bytes);
+        self.enqueue_or_wait(step, block)
+    }
+
+    /// Why nothing is written any more, once it is known; told once.
+    pub fn failure(&mut self) -> Option<RecordError> {
+        if !self.has_ended() {
+            return None;
+        }
+        let ended = self.thread.take()?.join().expect("the recorder's thread returns its errors");
+        ended.err()
+    }
+
+    fn has_ended(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
+    /// Writes what waits, then the end. Waits for the disk. Of a failure that has been told, nothing is said
+    /// again.
     pub fn finish(self, end: RunEnd) -> Result<Recorded, RecordError> {
         // When the thread has failed nobody takes this; it says why below.
         let _ = self.queue.send(Message::End(end, self.missing));
         drop(self.queue);
-        self.thread.join().expect("the recorder's thread returns its errors")
+        match self.thread {
+            Some(thread) => thread.join().expect("the recorder's thread returns its errors"),
+            None => Ok(Recorded { steps: 0, bytes: 0, missing: Vec::new() }),
+        }
     }
 
     fn buffer(&mut self) -> Vec<u8> {
@@ -232,21 +284,24 @@ impl Recorder {
 }
 
 /// The recorder's thread.
-fn write(
-    out: impl Output,
+fn write<W: Output>(
+    open: impl FnOnce() -> io::Result<W>,
     metadata: &Metadata,
     inbox: &Receiver<Message>,
     done: &Sender<Vec<u8>>,
     waiting: &AtomicUsize,
 ) -> Result<Recorded, RecordError> {
     let failed = |steps, source: WriteError| RecordError::Write { steps, source };
-    let mut writer = Writer::new(BufWriter::with_capacity(BUFFER, out), metadata)
-        .map_err(|source| failed(0, source.into()))?;
-    // At once: a file without its head says nothing, however little of the run is in it.
-    writer.flush().map_err(|source| failed(0, source.into()))?;
-    let mut flushed = Instant::now();
+    let mut message = match inbox.recv() {
+        Ok(message @ Message::Block(_)) => Ok(message),
+        // Nothing happened, so nothing is made.
+        Ok(Message::End(_, missing)) => return Ok(Recorded { steps: 0, bytes: 0, missing }),
+        Err(_) => return Ok(Recorded { steps: 0, bytes: 0, missing: Vec::new() }),
+    };
+    let begin = || Writer::new(BufWriter::with_capacity(BUFFER, open()?), metadata);
+    let mut writer = begin().map_err(|source| failed(0, source.into()))?;
+    let mut flushed = None;
     loop {
-        let message = inbox.recv_timeout(FLUSH_EVERY);
         match message {
             Ok(Message::Block(block)) => {
                 let appended = writer.append(&block);
@@ -259,10 +314,17 @@ fn write(
             // Whoever recorded is gone without a word: the file ends as if it had been killed.
             Err(RecvTimeoutError::Disconnected) => return abandon(writer),
         }
-        if flushed.elapsed() >= FLUSH_EVERY {
-            writer.flush().map_err(|source| failed(writer.steps(), source.into()))?;
-            flushed = Instant::now();
+        // At once the first time: a file without its head says nothing, however little of the run is in it.
+        if flushed.is_none_or(|at: Instant| at.elapsed() >= FLUSH_EVERY) {
+            let is_first = flushed.is_none();
+            let told = writer.flush().and_then(|()| {
+                let out = writer.out_mut().get_mut();
+                if is_first { out.appear() } else { out.check() }
+            });
+            told.map_err(|source| failed(writer.steps(), source.into()))?;
+            flushed = Some(Instant::now());
         }
+        message = inbox.recv_timeout(FLUSH_EVERY);
     }
 }
 
@@ -274,7 +336,9 @@ fn close<W: Output>(
     let steps = writer.steps();
     let close = || -> io::Result<Recorded> {
         let (buffer, footer, bytes) = writer.finish(end, missing)?;
-        buffer.into_inner()?.sync()?;
+        let mut out = buffer.into_inner()?;
+        out.sync()?;
+        out.check()?;
         Ok(Recorded { steps, bytes, missing: footer.missing })
     };
     close().map_err(|source| RecordError::Write { steps, source: source.into() })
@@ -284,31 +348,4 @@ fn abandon<W: Output>(mut writer: Writer<BufWriter<W>>) -> Result<Recorded, Reco
     let steps = writer.steps();
     writer.flush().map_err(|source| RecordError::Write { steps, source: source.into() })?;
     Ok(Recorded { steps, bytes: writer.bytes(), missing: Vec::new() })
-}
-
-/// A new file in the place of nothing, or of a recording.
-fn create(path: &Path) -> Result<File, RecordError> {
-    let failed = |source| RecordError::Create { path: path.to_owned(), source };
-    let new = || OpenOptions::new().write(true).create_new(true).mode(0o600).open(path);
-    match new() {
-        Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
-            if !is_replaceable(path).map_err(failed)? {
-                return Err(RecordError::Occupied(path.to_owned()));
-            }
-            // Not emptied but replaced: somebody may be reading it, and others may have been allowed to.
-            std::fs::remove_file(path).map_err(failed)?;
-            new().map_err(failed)
-        }
-        result => result.map_err(failed),
-    }
-}
-
-/// Whether a file is a recording, or empty.
-fn is_replaceable(path: &Path) -> io::Result<bool> {
-    if !std::fs::metadata(path)?.is_file() {
-        return Ok(false);
-    }
-    let mut head = Vec::new();
-    File::open(path)?.take(FILE_MAGIC.len() as u64).read_to_end(&mut head)?;
-    Ok(head.is_empty() || head == FILE_MAGIC)
 }

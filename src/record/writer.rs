@@ -70,6 +70,11 @@ impl<W: Write> Writer<W> {
         self.out.flush()
     }
 
+    /// What is written to.
+    pub(super) fn out_mut(&mut self) -> &mut W {
+        &mut self.out
+    }
+
     /// The step written last.
     pub fn last_step(&self) -> Option<u64> {
         self.index.last().map(|entry| entry.step)

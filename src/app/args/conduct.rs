@@ -1,7 +1,7 @@
 //! How a run is shared out, waits, keeps time and replaces.
 
 use crate::app::AppError;
-use crate::process::{OnMiss, Pace, Placement, Timing, WaitMode};
+use crate::process::{OnMiss, Pace, Placement, RecordLag, Timing, WaitMode};
 use crate::scenario::Scenario;
 use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
 use clap::{Args, ValueEnum};
@@ -144,6 +144,10 @@ pub(in crate::app) struct ConductArgs {
     pub restart: Restart,
     #[command(flatten)]
     pub timing: TimingArgs,
+    /// What becomes of a step that cannot be recorded in time: the run waits, or the recording lacks it
+    /// [default: wait; with a deadline: drop].
+    #[arg(long, value_enum)]
+    pub record_lag: Option<RecordLag>,
 }
 
 impl ConductArgs {
@@ -153,7 +157,14 @@ impl ConductArgs {
         flags.extend(["--wait".to_owned(), name_of(self.wait_mode)]);
         flags.extend(["--restart".to_owned(), name_of(self.restart)]);
         flags.extend(self.timing.to_flags());
+        flags.extend(["--record-lag".to_owned(), name_of(self.record_lag())]);
         flags
+    }
+
+    /// What becomes of steps that cannot be recorded in time.
+    pub fn record_lag(&self) -> RecordLag {
+        let keeps_time = self.timing.is_given();
+        self.record_lag.unwrap_or(if keeps_time { RecordLag::Drop } else { RecordLag::Wait })
     }
 }
 

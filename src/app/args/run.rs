@@ -68,6 +68,9 @@ pub(in crate::app) struct WorldArgs {
     /// Go on from this recording, which decides the scenario and the numbers of processes.
     #[arg(long, hide = true, value_name = "FILE")]
     pub resume: Option<PathBuf>,
+    /// So many of its steps [default: all up to the first that is missing].
+    #[arg(long, hide = true, value_name = "N", requires = "resume")]
+    pub resume_steps: Option<u64>,
     /// Process id of the supervisor: report to it on stdout, and end with it.
     #[arg(long, hide = true, value_name = "PID")]
     pub supervised: Option<u32>,

@@ -1,7 +1,9 @@
-//! Blocks of bytes for whoever looks on: a service that overflows, so that nobody waits for a reader.
+//! Blocks of bytes for whoever looks on: a service that overflows, so that nobody waits for a reader, or one
+//! that says when it is full.
 
 use super::space::{RunSpace, SpaceError, failed, service_name};
 use crate::transport::TransportError;
+use iceoryx2::port::BackpressureAction;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::AllocationStrategy;
@@ -24,7 +26,8 @@ impl BlockOutbox {
         self.factory.dynamic_config().number_of_subscribers() > 0
     }
 
-    /// Sends a block of that many bytes, which `fill` writes piece by piece where it will be read.
+    /// Sends a block of that many bytes, which `fill` writes piece by piece where it will be read. `false` when
+    /// nobody got it: there is no reader, or as many blocks wait as may in a service that does not overflow.
     ///
     /// # Panics
     /// When `fill` writes another number of bytes.
@@ -32,7 +35,7 @@ impl BlockOutbox {
         &self,
         length: usize,
         fill: impl FnOnce(&mut dyn FnMut(&[u8])),
-    ) -> Result<(), TransportError> {
+    ) -> Result<bool, TransportError> {
         let failed = |reason: String| TransportError::Failed { service: self.service.clone(), reason };
         let mut sample = self.publisher.loan_slice(length).map_err(|e| failed(format!("{e:?}")))?;
         let mut rest = sample.payload_mut();
@@ -42,8 +45,8 @@ impl BlockOutbox {
             rest = after;
         });
         assert!(rest.is_empty(), "a block is as long as was said");
-        sample.send().map_err(|e| failed(format!("{e:?}")))?;
-        Ok(())
+        let reached = sample.send().map_err(|e| failed(format!("{e:?}")))?;
+        Ok(reached > 0)
     }
 }
 
@@ -76,18 +79,20 @@ impl BlockInbox {
 }
 
 impl RunSpace {
-    /// Creates a service for blocks of about so many bytes, as many of which may wait to be read.
+    /// Creates a service for blocks of about so many bytes, as many of which may wait to be read; when there are
+    /// more, the oldest gives way, or the newest is not sent.
     pub fn create_blocks(
         &self,
         name: &str,
         expected: usize,
         waiting: usize,
+        overflows: bool,
     ) -> Result<BlockOutbox, SpaceError> {
         let factory = self
             .node()
             .service_builder(&service_name(name)?)
             .publish_subscribe::<[u8]>()
-            .enable_safe_overflow(true)
+            .enable_safe_overflow(overflows)
             .subscriber_max_buffer_size(waiting)
             .subscriber_max_borrowed_samples(2)
             .max_publishers(1)
@@ -99,6 +104,7 @@ impl RunSpace {
             .publisher_builder()
             .initial_max_slice_len(expected)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
+            .set_backpressure_handler(|_| BackpressureAction::DiscardData)
             .create()
             .map_err(|e| failed(&format!("create a publisher of {name}"), &e))?;
         Ok(BlockOutbox { service: name.to_owned(), publisher, factory })

@@ -1,0 +1,128 @@
+//! What the commands say of a recording.
+
+use super::common::Site;
+use super::*;
+use std::os::unix::fs::PermissionsExt;
+
+#[test]
+fn a_recording_of_another_version_is_refused_by_all_who_read_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("old.czlog");
+    let name = file.to_str().unwrap();
+    for (found, version) in [(1_u32, "1"), (3, "3"), (u32::MAX, "4294967295")] {
+        let mut bytes = small().bytes;
+        bytes[8..12].copy_from_slice(&found.to_le_bytes());
+        std::fs::write(&file, &bytes).unwrap();
+        for arguments in [
+            &["show", name][..],
+            &["verify", name, name],
+            &["replay", name],
+            &["resume", name],
+            &["branch", name, "--at", "5", "--set", "objective.beta=1.0"],
+        ] {
+            let output = Site::new("old").command("cz").args(arguments).output().unwrap();
+            let said = String::from_utf8(output.stderr).unwrap();
+            let expected = format!(
+                "cz: {name}: the recording has format version {version}, this program reads version 2\n"
+            );
+            assert_eq!((output.status.code(), said), (Some(2), expected), "{arguments:?}");
+        }
+    }
+}
+
+#[test]
+fn the_commands_tell_what_is_in_a_file() {
+    let site = Site::new("rec");
+    let directory = tempfile::tempdir().unwrap();
+    let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
+    let cz = |arguments: &[&str]| {
+        let output = site.command("cz").args(arguments).output().unwrap();
+        let text = |bytes| String::from_utf8(bytes).unwrap();
+        (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
+    };
+    let (file, other) = (path("a.czlog"), path("b.czlog"));
+    let record = |file: &str, arguments: &[&str]| {
+        let all = ["run", "--in-process", "--set", "end.vehicles=12", "--json", "-", "--record", file];
+        let (code, out, err) = cz(&[&all[..], arguments].concat());
+        assert_eq!(code, 0, "{err}");
+        assert!(err.contains("recorded") && err.contains(file), "{err}");
+        common::hash(&serde_json::from_str(&out).unwrap())
+    };
+    let hash = record(&file, &[]);
+    assert_eq!(record(&other, &["--coord-procs", "2", "--ctrl-procs", "2"]), hash);
+    let mode = |path: &str| std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert_eq!(mode(&file), 0o600);
+
+    let (code, out, _) = cz(&["show", &file]);
+    assert_eq!(code, 0);
+    for word in ["two-merges", "seed 1", "end.vehicles=12", "1 controller", &hash, "every step checked"] {
+        assert!(out.contains(word), "no {word:?} in {out}");
+    }
+    let json = |arguments: &[&str]| -> serde_json::Value {
+        let (code, out, err) = cz(arguments);
+        assert_eq!(code, 0, "{err}");
+        serde_json::from_str(&out).unwrap()
+    };
+    let shown = json(&["show", &other, "--json"]);
+    assert_eq!(shown["state_hash"], hash);
+    assert_eq!(shown["whole"], true);
+    let step = json(&["show", &file, "--step", "200", "--json"]);
+    let reader = Reader::open(file.as_ref()).unwrap();
+    let recorded = reader.step(200).unwrap().unwrap();
+    assert_eq!(step["state"].as_array().unwrap().len(), recorded.state.len());
+    assert_eq!(step["state"][0]["x_m"].as_f64(), Some(recorded.state[0].x_m));
+    let (_, out, _) = cz(&["show", &file, "--step", "200"]);
+    assert!(out.contains("merge-1.main") && out.contains("verdict"), "{out}");
+    let vehicle = recorded.commands[0].records[0].vehicle.to_string();
+    let course = json(&["show", &file, "--vehicle", &vehicle, "--json"]);
+    assert!(course["course"].as_array().unwrap().iter().any(|row| row["step"] == 200), "{course}");
+    let (_, out, _) = cz(&["show", &file, "--vehicle", &vehicle]);
+    assert!(out.contains("OCBF"), "{out}");
+    let (_, out, _) = cz(&["show", &file, "--scenario"]);
+    assert!(out.contains("--set end.vehicles=12") && out.contains("[[zones]]"), "{out}");
+
+    assert_eq!(cz(&["verify", &file, &other]).0, 0);
+    let (code, out, _) = cz(&["replay", &other]);
+    assert_eq!(code, 0, "{out}");
+    assert!(out.contains("coordinator 1") && out.contains(&hash), "{out}");
+    assert_eq!(json(&["replay", &file, "--json"])["same"], true);
+
+    // Another seed is another run.
+    record(&other, &["--seed", "2"]);
+    let (code, out, err) = cz(&["verify", &file, &other]);
+    assert_eq!(code, 1, "{out}");
+    assert!(out.contains("scenarios differ") && out.contains("first difference: step 1, vehicle 0"), "{out}");
+    assert!(err.contains("differ"), "{err}");
+
+    // Damage and a cut.
+    let mut bytes = std::fs::read(&file).unwrap();
+    bytes.truncate(bytes.len() * 2 / 3);
+    std::fs::write(&other, &bytes).unwrap();
+    let (code, out, _) = cz(&["show", &other]);
+    assert!(code == 0 && out.contains("cut off") && out.contains("whole       no"), "{out}");
+    assert_eq!(cz(&["replay", &other]).0, 0);
+    assert_eq!(cz(&["verify", &file, &other]).0, 1);
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&other, &bytes).unwrap();
+    for command in [&["show", &other][..], &["replay", &other], &["verify", &file, &other]] {
+        let (code, _, err) = cz(command);
+        assert!(code == 2 && err.contains("damaged at byte"), "{command:?}: {err}");
+    }
+
+    // What is no recording is neither read nor replaced.
+    let text = path("notes.txt");
+    std::fs::write(&text, "notes").unwrap();
+    assert_eq!(cz(&["show", &text]).0, 2);
+    let (code, _, err) = cz(&["run", "--in-process", "--record", &text]);
+    assert!(code == 2 && err.contains("not a recording"), "{err}");
+    assert_eq!(std::fs::read_to_string(&text).unwrap(), "notes");
+    // One that others may read is replaced by one they may not.
+    std::fs::set_permissions(&other, PermissionsExt::from_mode(0o644)).unwrap();
+    record(&other, &[]);
+    assert_eq!(mode(&other), 0o600);
+    for arguments in [&["show", &file, "--step", "99999"][..], &["show", &file, "--vehicle", "99999"]] {
+        let (code, _, err) = cz(arguments);
+        assert!(code == 2 && err.contains("99999"), "{err}");
+    }
+}
