@@ -1,10 +1,11 @@
 //! The summary of a run: as JSON, and as a table for people.
 
+use super::show::number;
 use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
 use crate::process::{LatencyUs, Outcome, Punctuality, Replacement, Settled};
 use crate::scenario::{Scenario, ShieldMode};
-use crate::world::{FaultCounts, ShieldSummary, ZoneSummaryRow};
+use crate::world::{FaultCounts, OverlapSummary, ShieldSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
 use serde::Serialize;
 use std::path::Path;
@@ -28,6 +29,7 @@ pub(super) struct Summary {
     departed: u32,
     held_arrivals: u32,
     waiting: u32,
+    overlaps: OverlapSummary,
     shield: ShieldSummary,
     #[serde(skip_serializing_if = "Option::is_none")]
     faults: Option<FaultCounts>,
@@ -85,6 +87,7 @@ impl Summary {
             departed: world.departed,
             held_arrivals: world.held_arrivals,
             waiting: world.waiting,
+            overlaps: world.overlaps,
             shield: world.shield,
             faults: world.faults,
             replacements: outcome.replacements,
@@ -101,8 +104,14 @@ impl Summary {
         Summary { show_placement, ..self }
     }
 
-    /// Prints the table, or writes the JSON, or both.
+    /// Prints the table, or writes the JSON, or both; what nobody should miss goes to stderr as well.
     pub fn deliver(&self, json: Option<&Path>) -> Result<(), AppError> {
+        let results = self.deliver_results(json);
+        self.warnings().iter().for_each(|warning| eprintln!("cz: warning: {warning}"));
+        results
+    }
+
+    fn deliver_results(&self, json: Option<&Path>) -> Result<(), AppError> {
         let Some(path) = json else { return print(&self.table()) };
         let text = serde_json::to_string_pretty(self).expect("a summary has string keys only") + "\n";
         if path == Path::new("-") {
@@ -113,6 +122,28 @@ impl Summary {
         std::fs::write(path, text)
             .map_err(|e| AppError::Failed(format!("cannot write {}: {e}", path.display())))?;
         printed
+    }
+
+    /// What makes the results doubtful, a line each.
+    fn warnings(&self) -> Vec<String> {
+        self.overlap_line().into_iter().collect()
+    }
+
+    fn overlap_line(&self) -> Option<String> {
+        let o = &self.overlaps;
+        let first = o.first.as_ref()?;
+        Some(format!(
+            "bodies overlapped: {} of vehicles, {:.2} s in all ({}), by up to {:.2} m; first {} and {} in {} at \
+             {:.1} s",
+            number(o.pairs, "pair"),
+            o.time_s,
+            number(o.samples, "sample"),
+            o.deepest_m,
+            first.vehicles[0],
+            first.vehicles[1],
+            first.zone,
+            first.step as f64 * self.dt_s
+        ))
     }
 
     fn table(&self) -> String {
@@ -182,6 +213,9 @@ impl Summary {
                 "{} vehicles were still inside at the end\n",
                 self.arrived - self.departed
             ));
+        }
+        if let Some(line) = self.overlap_line() {
+            text.push_str(&format!("{line}\n"));
         }
         shield_lines(&self.shield, &mut text);
         if let Some(f) = &self.faults {

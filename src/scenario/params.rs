@@ -13,7 +13,7 @@ pub struct VehicleParams {
     pub v_min_mps: f64,
     /// Greatest speed, m/s.
     pub v_max_mps: f64,
-    /// Vehicle length, m. Only decides when an arrival would overlap another vehicle.
+    /// Vehicle length, m: the body reaches back by it from the position.
     pub length_m: f64,
     /// Reaction time, s (paper: phi in `Safety`).
     pub reaction_time_s: f64,

@@ -63,6 +63,54 @@ impl Held {
         Some(root.min(within_s))
     }
 
+    /// How long within `[from_s, to_s]` another vehicle, moved on by `shift_m`, is less than `distance_m` away,
+    /// ahead or behind, s; and the least distance in that time, m.
+    pub fn time_within(
+        &self,
+        other: &Held,
+        shift_m: f64,
+        distance_m: f64,
+        (from_s, to_s): (f64, f64),
+    ) -> (f64, f64) {
+        let ahead_m = |t: f64| other.position_m(t) + shift_m - self.position_m(t);
+        let (mut time_s, mut least_m) = (0.0, f64::INFINITY);
+        let mut start = from_s;
+        // Between the instants at which one of the two stops, the distance is a parabola.
+        let (a, b) = (self.stop_s.min(other.stop_s), self.stop_s.max(other.stop_s));
+        for end in [a.min(to_s), b.min(to_s), to_s] {
+            if end < start || (end == start && end != to_s) {
+                continue;
+            }
+            let mid = 0.5 * (start + end);
+            let u = |held: &Held| if mid < held.stop_s { held.u_mps2 } else { 0.0 };
+            let curvature = u(other) - u(self);
+            let slope = other.speed_mps(start) - self.speed_mps(start);
+            let distance = ahead_m(start);
+            // Where it turns, and where it reaches one of these distances.
+            let mut turns = [start, end, start, start, start, start, start, start, start];
+            let mut put = |at: usize, after_s: f64| {
+                if after_s > 0.0 && start + after_s < end {
+                    turns[at] = start + after_s;
+                }
+            };
+            put(2, -slope / curvature);
+            for (i, level) in [distance_m, 0.0, -distance_m].into_iter().enumerate() {
+                let c = distance - level;
+                let root = (slope * slope - 2.0 * curvature * c).sqrt();
+                // In the form that does not cancel; NaN and infinity, where there is none, are not put.
+                let q = -(slope + root.copysign(slope));
+                put(3 + 2 * i, q / curvature);
+                put(4 + 2 * i, 2.0 * c / q);
+            }
+            turns.sort_unstable_by(f64::total_cmp);
+            least_m = turns.iter().fold(least_m, |least, &t| least.min(ahead_m(t).abs()));
+            let spans = turns.windows(2).filter(|w| ahead_m(0.5 * (w[0] + w[1])).abs() < distance_m);
+            time_s += spans.map(|w| w[1] - w[0]).sum::<f64>();
+            start = end;
+        }
+        (time_s, least_m)
+    }
+
     /// Least value over `[0, within_s]` of `leader - self + shift_m - reaction_s * v - gap_m`, m: the
     /// rear-end margin between samples as well as at them.
     #[inline]
@@ -143,6 +191,29 @@ mod tests {
                 Some(t) => prop_assert!((held.position_m(t) - (100.0 + ahead)).abs() < 1e-12 * 200.0),
                 None => prop_assert!(held.position_m(0.1) < 100.0 + ahead),
             }
+        }
+
+        #[test]
+        fn time_within_a_distance_is_what_sampling_finds(
+            v in 0.0..30.0f64, u in -4.0..4.0f64, vo in 0.0..30.0f64, uo in -4.0..4.0f64,
+            ahead in -12.0..12.0f64, shift in -3.0..3.0f64, distance in 0.1..8.0f64,
+            from in 0.0..0.5f64, dt in 0.01..3.0f64,
+        ) {
+            let own = Held::new(0.0, v, u);
+            let other = Held::new(ahead, vo, uo);
+            let to = from + dt;
+            let (time, least) = own.time_within(&other, shift, distance, (from, to));
+            const N: u32 = 4000;
+            let apart = |i: u32| {
+                let t = from + dt * (f64::from(i) + 0.5) / f64::from(N);
+                (other.position_m(t) + shift - own.position_m(t)).abs()
+            };
+            let brute = (0..N).filter(|&i| apart(i) < distance).count() as f64 * dt / f64::from(N);
+            // The boundary is met at most four times per span, of which there are three.
+            prop_assert!((time - brute).abs() <= 12.0 * dt / f64::from(N), "{time}, sampled {brute}");
+            let sampled = (0..N).map(apart).fold(f64::INFINITY, f64::min);
+            prop_assert!(least <= sampled + 1e-9 && sampled - least < 42.0 * dt / f64::from(N));
+            prop_assert_eq!(time > 0.0, least < distance, "{} {}", time, least);
         }
 
         #[test]

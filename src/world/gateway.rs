@@ -11,7 +11,7 @@ use super::link::LinkCar;
 use super::metrics::{ShieldRow, ShieldSummary};
 use super::role::World;
 use crate::lanes::AHEAD;
-use crate::scenario::{Drivers, Exit, Scenario, ShieldMode};
+use crate::scenario::{Drivers, Exit, Scenario, ShieldMode, ZoneId};
 use crate::shield::{Duty, Partner, RESERVE_M, Row, Shield};
 use crate::vehicle::Held;
 use ipc_schemas::{self as frames, VehicleCommand};
@@ -387,21 +387,34 @@ impl World {
 
     /// Index 0 moves with the vehicle it stands for.
     pub(super) fn hold_left(&mut self, scenario: &Scenario, zone: usize) {
-        let Car { vehicle, v_mps, .. } = self.cars[zone][0];
-        let mut u = self.followed_mps2(zone, vehicle);
-        // Out of the network nobody drives it. Whoever left it creeping must not creep for ever: those behind
-        // would have to leave more slowly each, down to a standstill.
-        if self.sites[zone].exit == Exit::Out && v_mps < LEAST_EXIT_MPS {
-            u = EXIT_MPS2.min(scenario.vehicle.u_max_mps2);
-        }
+        let mut left_from = self.sites[zone].left_from;
+        let u = self.left_mps2(scenario, zone, &mut left_from, &self.cars[zone][0]);
+        self.sites[zone].left_from = left_from;
         self.cars[zone][0].command_mps2 = u;
     }
 
-    /// What the vehicle that left a zone last holds over the step, wherever it is now; 0 once it has left
-    /// the network.
-    fn followed_mps2(&mut self, zone: usize, vehicle: u32) -> f64 {
+    /// What a vehicle that has left a zone holds over the step; `left_from` is the last zone it is known to
+    /// have left.
+    pub(super) fn left_mps2(
+        &self,
+        scenario: &Scenario,
+        zone: usize,
+        left_from: &mut ZoneId,
+        car: &Car,
+    ) -> f64 {
+        let u = self.followed_mps2(left_from, car.vehicle);
+        // Out of the network nobody drives it. Whoever left it creeping must not creep for ever: those behind
+        // would have to leave more slowly each, down to a standstill.
+        if self.sites[zone].exit == Exit::Out && car.v_mps < LEAST_EXIT_MPS {
+            return EXIT_MPS2.min(scenario.vehicle.u_max_mps2);
+        }
+        u
+    }
+
+    /// What a vehicle holds over the step, wherever it is now; 0 once it has left the network.
+    fn followed_mps2(&self, left_from: &mut ZoneId, vehicle: u32) -> f64 {
         loop {
-            let from = self.sites[zone].left_from as usize;
+            let from = *left_from as usize;
             if self.on_links > 0
                 && let Some(on_link) = self.links[from].cars.iter().find(|c| c.car.vehicle == vehicle)
             {
@@ -411,7 +424,7 @@ impl World {
             if let Some(car) = self.members(next as usize).iter().rev().find(|c| c.vehicle == vehicle) {
                 return car.command_mps2;
             }
-            self.sites[zone].left_from = next;
+            *left_from = next;
         }
     }
 

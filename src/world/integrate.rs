@@ -40,6 +40,9 @@ impl World {
         self.scratch.leaders.clear();
         self.events.clear();
         self.gates.advance(&scenario.network.roads, scenario.time_s(self.step + 1));
+        if self.on_links > 0 {
+            (0..self.links.len()).for_each(|zone| self.observe_link_overlaps(&scenario, zone, dt_s));
+        }
         let mut queue = 0;
         // All that concerns a zone at one go, while its vehicles are in the cache. Motions start from the
         // step's beginning, so it does not matter which zone has moved on already.
@@ -49,6 +52,7 @@ impl World {
                 self.hold_left(&scenario, zone);
             }
             let crosses = self.look(&scenario, zone, dt_s);
+            self.observe_overlaps(&scenario, zone, dt_s, crosses);
             self.sites[zone].left_now = crosses;
             if crosses {
                 self.cross(&scenario, zone, now_s, dt_s);
@@ -118,6 +122,13 @@ impl World {
         let site = &mut self.sites[zone];
         let metrics = &mut self.metrics[zone];
         let motions = &mut self.scratch.motions;
+        let overlaps = &mut self.overlaps;
+        let body_m = scenario.vehicle.length_m;
+        let mut pass_over = |car: &Car, held: &Held, left_from: ZoneId| {
+            let mut car = *car;
+            car.move_on(held, dt_s);
+            overlaps.keep_tail(zone, car, left_from, lengths_m[car.path as usize], body_m);
+        };
         let first_member = site.first();
         let mut last: Option<(f64, Car, Held)> = None;
         let mut kept = first_member;
@@ -158,7 +169,11 @@ impl World {
                 });
             }
             if first {
-                last = Some((after_s, car, held));
+                if let Some((_, car, held)) = last.replace((after_s, car, held)) {
+                    pass_over(&car, &held, zone as ZoneId);
+                }
+            } else {
+                pass_over(&car, &held, zone as ZoneId);
             }
             let Exit::Zone { zone: down, path, link_m } = site.exit else {
                 self.departed += 1;
@@ -179,7 +194,9 @@ impl World {
             }
         }
         let (_, car, held) = last.expect("somebody crosses");
-        if !site.has_left {
+        if site.has_left {
+            pass_over(&cars[0], &motions[0], site.left_from);
+        } else {
             // The first to leave makes room for itself.
             cars.copy_within(..kept, 1);
             motions.copy_within(..kept, 1);
@@ -196,14 +213,19 @@ impl World {
     fn leave_link(&mut self, zone: usize, now_s: f64, dt_s: f64) {
         let Exit::Zone { zone: down, path, .. } = self.sites[zone].exit else { return };
         let Link { length_m, cars } = &mut self.links[zone];
-        while let Some(LinkCar { car, held }) = cars.first() {
-            let Some(after_s) = held.passes_m(*length_m, dt_s) else { return };
+        let mut at = 0;
+        // All of them: where one has passed another, the first in the list is not the foremost.
+        while let Some(LinkCar { car, held }) = cars.get(at) {
+            let Some(after_s) = held.passes_m(*length_m, dt_s) else {
+                at += 1;
+                continue;
+            };
             let mut next = Car::entering(car.vehicle, path, now_s + after_s, held.speed_mps(after_s));
             next.move_on(held, dt_s);
             next.x_m -= *length_m;
             next.visit.energy = held.energy(dt_s) - held.energy(after_s);
             self.scratch.entries.push(Entry { zone: down, car: next });
-            cars.remove(0);
+            cars.remove(at);
             self.on_links -= 1;
         }
     }

@@ -1,6 +1,7 @@
 //! What a run is judged by, per zone and in all.
 
 use super::car::Visit;
+use super::overlap::OverlapSummary;
 use crate::scenario::ShieldMode;
 use serde::{Deserialize, Serialize};
 
@@ -168,6 +169,8 @@ pub struct WorldSummary {
     pub waiting: u32,
     /// Per zone.
     pub zones: Vec<ZoneSummaryRow>,
+    /// Bodies that overlapped.
+    pub overlaps: OverlapSummary,
     /// What the gateway did.
     pub shield: ShieldSummary,
     /// What went wrong on purpose, if anything was to.

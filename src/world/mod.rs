@@ -8,9 +8,11 @@ mod gateway;
 mod integrate;
 mod link;
 mod metrics;
+mod overlap;
 mod role;
 
 pub use change::ChangeError;
 pub use gateway::CommandFault;
 pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
+pub use overlap::{FirstOverlap, OverlapSummary};
 pub use role::{CoordinatorMasks, Sheet, World};

@@ -7,6 +7,7 @@ use super::gateway::Gateway;
 use super::integrate::{Entry, Leader};
 use super::link::Link;
 use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics};
+use super::overlap::Overlaps;
 use crate::lanes::{AHEAD, Lanes};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Exit, Scenario, ZoneId};
@@ -40,6 +41,7 @@ pub struct World {
     pub(super) arrived: u32,
     pub(super) departed: u32,
     pub(super) metrics: Vec<ZoneMetrics>,
+    pub(super) overlaps: Overlaps,
     /// Completed visits in the order in which they ended, when they are recorded.
     pub(super) visits: Option<Vec<CompletedVisit>>,
     /// Zones that had an event in the step just ended, ascending.
@@ -145,6 +147,7 @@ impl World {
             arrived: 0,
             departed: 0,
             metrics: vec![ZoneMetrics::default(); zones],
+            overlaps: Overlaps::new(zones),
             visits: None,
             events: Vec::new(),
             scratch: Scratch::default(),
@@ -385,6 +388,7 @@ impl World {
             departed: self.departed,
             held_arrivals: self.gates.held,
             waiting: self.gates.waiting.iter().map(|w| w.len() as u32).sum(),
+            overlaps: self.overlaps.summary(),
             shield: self.gateway.summary(),
             faults: self.faults.as_ref().map(|faults| faults.counts()),
             zones: zones
