@@ -39,7 +39,7 @@ fn a_good_controller_passes() {
 }
 
 /// Mode, rule, step (a vehicle may come later than the fault sets in), and words of the diagnosis.
-const BROKEN: [(&str, &str, Option<u64>, &str); 22] = [
+const BROKEN: [(&str, &str, Option<u64>, &str); 24] = [
     ("nan", "finite", Some(120), "field u_mps2"),
     ("bad-intent", "finite", Some(120), "planned_exit_time_s"),
     ("out-of-range", "limits", Some(120), "is commanded 4.5 m/s^2, which is not within [-4, 4]"),
@@ -61,6 +61,8 @@ const BROKEN: [(&str, &str, Option<u64>, &str); 22] = [
     ("too-slow", "deadline", None, "allowed are 100.0"),
     ("crash-at-start", "attach", Some(0), "SIGABRT"),
     ("crash-mid-run", "alive", Some(120), "SIGABRT"),
+    ("leaves-mid-run", "alive", Some(120), "exit status: 0"),
+    ("loses-track", "catch-up", None, "exit status: 1"),
     ("old-schema", "schema", Some(0), "build both from the same version"),
 ];
 
@@ -88,6 +90,7 @@ fn controllers_that_hang_or_end_badly_are_diagnosed() {
         ("empty-zone", "empty-zone", "no answer within 5 s"),
         ("never-ends", "end", "still there"),
         ("ends-badly", "end", "exit status: 3"),
+        ("stays-behind", "catch-up", "answered no step at hand"),
     ] {
         let (_, report) = check(mode);
         let breach = &report["breaches"][0];

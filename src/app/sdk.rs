@@ -30,7 +30,10 @@ pub(super) fn sdk(command: &SdkCommand) -> Result<(), AppError> {
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder).map_err(|e| failed(folder, e))?;
         }
-        std::fs::write(&path, contents).map_err(|e| failed(&path, e))
+        // Beside it, and then in its place: whoever runs with the old library keeps it.
+        let new = path.with_extension(format!("new-{}", std::process::id()));
+        std::fs::write(&new, contents).map_err(|e| failed(&new, e))?;
+        std::fs::rename(&new, &path).map_err(|e| failed(&path, e))
     };
     for library in LIBRARIES {
         let from = beside.join(library);

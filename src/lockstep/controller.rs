@@ -4,6 +4,7 @@ use super::refusals::Refusals;
 use super::world::check_state;
 use super::{Awaited, Handover, Identity, InHand, LockstepError, Progress, Refusal, RefusedFrames};
 use crate::control::ControllerPool;
+use crate::scenario::ControllerNames;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use ipc_schemas::{
     Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, HeaderFault, Role, VehicleCommand, VehicleState,
@@ -76,7 +77,7 @@ where
 
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
-        self.refusals.report(&self.identity)
+        self.refusals.report(&self.identity, &ControllerNames::default())
     }
 
     /// Does what can be done now.

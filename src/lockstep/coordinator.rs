@@ -5,6 +5,7 @@ use super::refusals::Refusals;
 use super::world::check_state;
 use super::{Awaited, Handover, Identity, InHand, LockstepError, Progress, Refusal, RefusedFrames};
 use crate::coordination::Coordinator;
+use crate::scenario::ControllerNames;
 use crate::scenario::ZoneId;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use ipc_schemas::{
@@ -97,7 +98,7 @@ where
 
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
-        self.refusals.report(&self.identity)
+        self.refusals.report(&self.identity, &ControllerNames::default())
     }
 
     /// Does what can be done now.

@@ -13,6 +13,7 @@ use crate::step::Step;
 use crate::transport::Frame;
 use ipc_schemas::{Assignment, FrameHeader, Role, VehicleCommand, VehicleState, ZoneSummary};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
 
 /// What a participant needs in order to go on from the present step.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -37,6 +38,21 @@ pub struct Handover {
     pub fresh: Vec<ZoneSummary>,
     /// To a coordinator: bit per coordinator process that has an event in that step, and so sends summaries.
     pub events: u64,
+}
+
+impl Handover {
+    /// What a controller that keeps its own memory needs: the assignments in force, by zone, and the first step
+    /// whose coordination is not among them. A state that has been sent is handed over together with its
+    /// coordination, so that is the next one then.
+    pub fn assignments(&self) -> (u64, Vec<Assignment>) {
+        let sent = || self.coordination.iter().flat_map(|(_, assignments)| assignments);
+        let acted: BTreeSet<u32> = sent().map(|a| a.zone).collect();
+        let kept = self.in_force.iter().filter(|a| !acted.contains(&a.zone));
+        let mut all: Vec<Assignment> = kept.chain(sent()).copied().collect();
+        // Stable: within a zone the order is the coordinator's.
+        all.sort_by_key(|a| a.zone);
+        (self.step + u64::from(self.header.is_some()), all)
+    }
 }
 
 /// One controller's commands of one step.

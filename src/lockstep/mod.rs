@@ -18,6 +18,7 @@ pub use refusals::{Refusal, RefusedFrames};
 pub use world::{Seat, WorldDriver, WorldPorts};
 
 use crate::control::pool::PoolError;
+use crate::scenario::ControllerNames;
 use crate::step::StepFrames;
 use crate::transport::{Frame, TransportError};
 use ipc_schemas::{FrameHeader, HeaderFault, Role, VehicleState};
@@ -48,18 +49,19 @@ pub struct Awaited {
     pub step: u64,
 }
 
-impl std::fmt::Display for Awaited {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "{} of step {} from ", self.what, self.step)?;
-        if self.role == Role::World {
-            return f.write_str("the world");
-        }
-        let mut separator = "";
-        for index in (0..64).filter(|i| self.missing >> i & 1 == 1) {
-            write!(f, "{separator}{} {index}", self.role)?;
-            separator = ", ";
-        }
-        Ok(())
+impl Awaited {
+    /// What is awaited, in words.
+    pub fn named(&self, names: &ControllerNames) -> String {
+        let Awaited { role, missing, what, step } = *self;
+        let of = |index| match role {
+            Role::Controller => names.of(index),
+            role => format!("{role} {index}"),
+        };
+        let senders: Vec<String> = match role {
+            Role::World => vec!["the world".to_owned()],
+            _ => (0..64).filter(|i| missing >> i & 1 == 1).map(of).collect(),
+        };
+        format!("{what} of step {step} from {}", senders.join(", "))
     }
 }
 

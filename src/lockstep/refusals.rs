@@ -2,6 +2,7 @@
 
 use super::Identity;
 use crate::control::pool::PoolError;
+use crate::scenario::ControllerNames;
 use crate::world::CommandFault;
 use ipc_schemas::{FrameHeader, HeaderFault, Role};
 use serde::{Deserialize, Serialize};
@@ -147,11 +148,15 @@ impl Refusals {
     }
 
     /// All of it, as refused by this receiver.
-    pub fn report(&self, receiver: &Identity) -> Vec<RefusedFrames> {
+    pub fn report(&self, receiver: &Identity, names: &ControllerNames) -> Vec<RefusedFrames> {
         let receiver = Claim { role: receiver.role as u16, index: receiver.index }.to_string();
+        let claimed = |claim: Claim| match Role::from_code(claim.role) {
+            Some(Role::Controller) => names.of(u32::from(claim.index)),
+            _ => claim.to_string(),
+        };
         let sender = |a: &Account| match a.process_id {
-            Some(id) => format!("{} (process {id})", a.claim),
-            None => a.claim.to_string(),
+            Some(id) => format!("{} (process {id})", claimed(a.claim)),
+            None => claimed(a.claim),
         };
         self.accounts
             .iter()

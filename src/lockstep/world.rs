@@ -5,6 +5,7 @@ use super::{
     Awaited, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal, RefusedFrames, mask_of,
     sender,
 };
+use crate::scenario::ControllerNames;
 use crate::scenario::share::zones_of;
 use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots};
@@ -194,9 +195,14 @@ where
         Ok(true)
     }
 
+    /// What the controllers of the run are called.
+    pub fn names(&self) -> ControllerNames {
+        ControllerNames::new(self.world.scenario(), self.controllers.len() as u32)
+    }
+
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
-        self.refusals.report(&self.identity)
+        self.refusals.report(&self.identity, &self.names())
     }
 
     /// The number of answers that came too late or twice.
@@ -217,7 +223,11 @@ where
         let (role, index, refusal) = self.suspect.as_ref()?;
         let Phase::Collect(missing) = self.phase else { return None };
         let mask = if *role == Role::Coordinator { missing.coordination } else { missing.commands };
-        (mask >> index & 1 == 1).then(|| (format!("{role} {index}"), refusal))
+        let name = || match role {
+            Role::Controller => self.names().of(u32::from(*index)),
+            role => format!("{role} {index}"),
+        };
+        (mask >> index & 1 == 1).then(|| (name(), refusal))
     }
 
     /// What a process needs that takes a place now. `None` when that is not known yet (a controller must

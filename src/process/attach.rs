@@ -309,15 +309,16 @@ impl Reception {
         let joins = request.phase == frames::ATTACH_JOIN;
         let seat = Seat::new(generation, request.process_id);
         let handed = if joins { Readiness::Begin } else { hand_over(role, index, seat) };
-        if let Some(plugin) = plugin {
-            return self.desk.reply(reply, &self.plugins[plugin]);
-        }
         match handed {
-            _ if joins => self.desk.reply(reply, &self.scenario),
+            _ if joins => self.desk.reply(reply, plugin.map_or(&self.scenario, |p| &self.plugins[p])),
             Readiness::Begin => self.desk.reply(reply, &[]),
             Readiness::Later => {
                 self.pending.push(request);
                 Ok(())
+            }
+            Readiness::Now(handover) if plugin.is_some() => {
+                let (first_step, assignments) = handover.assignments();
+                self.desk.reply(AttachReply { first_step, ..reply }, frames::bytes_of(&assignments))
             }
             Readiness::Now(handover) => {
                 let mut bytes = Vec::new();

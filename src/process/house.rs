@@ -62,7 +62,10 @@ impl House {
     ) -> Result<(), ProcessError> {
         if self.pacer.has_missed(&awaited) {
             match self.pacer.on_miss() {
-                OnMiss::Abort => return Err(ProcessError::DeadlineMissed { awaited }),
+                OnMiss::Abort => {
+                    let (step, awaited) = (awaited.step, awaited.named(&driver.names()));
+                    return Err(ProcessError::DeadlineMissed { step, awaited });
+                }
                 policy => self.overdue = policy.verdict(),
             }
         }
@@ -94,7 +97,7 @@ impl House {
             (Err(ProcessError::Timeout { awaited, seconds }), Some(peer)) => {
                 let consequence =
                     format!("nobody took its place within {seconds} s of waiting for {awaited}");
-                Err(ProcessError::PeerGone { peer, consequence })
+                Err(ProcessError::PeerGone { peer, name: peer.name(&driver.names()), consequence })
             }
             (result, _) => result,
         }

@@ -36,7 +36,7 @@ pub use world::{
     run_on_in_process, run_world,
 };
 
-use crate::lockstep::{Awaited, LockstepError};
+use crate::lockstep::LockstepError;
 use crate::scenario::DecodeError;
 use crate::transport::TransportError;
 use crate::transport::iox::SpaceError;
@@ -118,15 +118,17 @@ pub enum ProcessError {
     #[error("waited {seconds} s for {awaited}")]
     Timeout {
         /// What was waited for.
-        awaited: Awaited,
+        awaited: String,
         /// How long.
         seconds: f64,
     },
     /// A step was not done by its deadline, in a run that ends then.
-    #[error("the deadline of step {} was missed: no {awaited}", .awaited.step)]
+    #[error("the deadline of step {step} was missed: no {awaited}")]
     DeadlineMissed {
+        /// The step.
+        step: u64,
         /// What had not come.
-        awaited: Awaited,
+        awaited: String,
     },
     /// A participant sent what it should not have and nothing better since.
     #[error("{who} sent a frame that cannot be taken, and no good one since: {fault}")]
@@ -137,10 +139,12 @@ pub enum ProcessError {
         fault: crate::lockstep::Refusal,
     },
     /// A process of the run has ended or died.
-    #[error("{peer} (process {}) is gone; {consequence}", .peer.process_id)]
+    #[error("{name} (process {}) is gone; {consequence}", .peer.process_id)]
     PeerGone {
         /// Who.
         peer: Peer,
+        /// What it is called.
+        name: String,
         /// What that meant here.
         consequence: String,
     },

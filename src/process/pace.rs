@@ -2,6 +2,7 @@
 
 use super::{Percentiles, new_histogram};
 use crate::lockstep::Awaited;
+use crate::scenario::ControllerNames;
 use hdrhistogram::Histogram;
 use ipc_schemas::{Role, VERDICT_FALLBACK, VERDICT_HELD};
 use serde::{Deserialize, Serialize};
@@ -174,7 +175,7 @@ impl Pacer {
     }
 
     /// How punctual the run was; `None` where nothing was asked for.
-    pub fn report(&self) -> Option<Punctuality> {
+    pub fn report(&self, names: &ControllerNames) -> Option<Punctuality> {
         if self.timing.pace == Pace::Free && self.timing.deadline.is_none() {
             return None;
         }
@@ -188,7 +189,10 @@ impl Pacer {
                 .missed_by
                 .iter()
                 .map(|(role, index, steps)| MissedBy {
-                    participant: format!("{role} {index}"),
+                    participant: match role {
+                        Role::Controller => names.of(*index),
+                        role => format!("{role} {index}"),
+                    },
                     steps: *steps,
                 })
                 .collect(),
@@ -216,7 +220,7 @@ mod tests {
         assert_eq!(pacer.due(27), origin + Duration::from_millis(20));
         pacer.begin(8);
         while !pacer.has_missed(&Awaited { missing: 0b100, ..awaited }) {}
-        let report = pacer.report().expect("there was a schedule");
+        let report = pacer.report(&ControllerNames::default()).expect("there was a schedule");
         let by = |i: usize| (report.missed_by[i].participant.as_str(), report.missed_by[i].steps);
         assert_eq!((report.missed_steps, by(0), by(1)), (2, ("controller 0", 1), ("controller 2", 2)));
     }

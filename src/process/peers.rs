@@ -1,5 +1,6 @@
 //! Whether the other processes of a run are still alive.
 
+use crate::scenario::ControllerNames;
 use ipc_schemas::Role;
 
 /// Another process of the run.
@@ -18,6 +19,16 @@ impl std::fmt::Display for Peer {
         match self.role {
             Role::World => f.write_str("the world"),
             role => write!(f, "{role} {}", self.index),
+        }
+    }
+}
+
+impl Peer {
+    /// What to call it, where controllers have names.
+    pub fn name(&self, names: &ControllerNames) -> String {
+        match self.role {
+            Role::Controller => names.of(self.index),
+            _ => self.to_string(),
         }
     }
 }

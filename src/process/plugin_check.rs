@@ -2,15 +2,16 @@
 //!
 //! World, coordinator and the built-in pool run in this process; only the controller under test is another
 //! one. The script: an empty zone at first, vehicles that come and go, a world that pauses, a leader that
-//! brakes to a stop, a restart in mid-run, and the end of the run. A bad frame is noted under the rule it
+//! brakes to a stop, a restart in mid-run, steps that pass while the controller is stopped, and the end of the run. A bad frame is noted under the rule it
 //! breaks and replaced, so that one fault does not hide the others.
 
 use super::attach::{Readiness, Reception};
 use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
+use crate::lockstep::Handover;
 use crate::scenario::Scenario;
-use crate::transport::iox::{IoxInbox, IoxOutbox, RunName, RunSpace, ServiceLimits};
+use crate::transport::iox::{IoxFrame, IoxInbox, IoxOutbox, RunName, RunSpace, ServiceLimits};
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use crate::world::{CommandFault, World};
 use hdrhistogram::Histogram;
@@ -18,6 +19,7 @@ use ipc_schemas::{
     self as frames, Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault, Role,
     VehicleCommand, VehicleState,
 };
+use rustix::process::{Pid, Signal, kill_process_group};
 use serde::Serialize;
 use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
@@ -37,6 +39,12 @@ const PAUSE_AT: u64 = 300;
 const BRAKE_FROM: u64 = 400;
 const BRAKE_TO: u64 = 460;
 const RESTART_AT: u64 = 600;
+const STOP_AT: u64 = 750;
+const GO_ON_AT: u64 = 780;
+/// By this step it must have caught up.
+const CAUGHT_UP_BY: u64 = 880;
+/// How long each step waits for it meanwhile.
+const CATCH_UP_STEP: Duration = Duration::from_millis(50);
 const END_AT: u64 = 900;
 
 /// A rule of `docs/plugin-contract.md`.
@@ -65,12 +73,13 @@ pub enum Rule {
     Deadline,
     Alive,
     Restart,
+    CatchUp,
     End,
 }
 
 impl Rule {
     /// All rules, in the order of the report.
-    pub const ALL: [Rule; 22] = [
+    pub const ALL: [Rule; 23] = [
         Rule::Attach,
         Rule::Schema,
         Rule::Run,
@@ -92,6 +101,7 @@ impl Rule {
         Rule::Deadline,
         Rule::Alive,
         Rule::Restart,
+        Rule::CatchUp,
         Rule::End,
     ];
 
@@ -119,6 +129,7 @@ impl Rule {
             Rule::Deadline => "answers within the deadline, but for one step in a hundred",
             Rule::Alive => "stays alive and answers every step",
             Rule::Restart => "joins again after being killed, and goes on from there",
+            Rule::CatchUp => "goes on with the step at hand after steps have passed without it",
             Rule::End => "ends with code 0 when the run does",
         }
     }
@@ -167,11 +178,12 @@ pub fn check(
     world.share_out(INDEX + 1);
     let zones = 0..scenario.network.zones.len() as u32;
     let mut kit = Kit {
-        reception: Reception::open(&space, scenario, run_id, (0, INDEX + 1), WaitMode::Hybrid)?,
+        reception: Reception::open(&space, scenario, run_id, (1, INDEX + 1), WaitMode::Hybrid)?,
         state: state.outbox(256)?,
         coordination: coordination.outbox(512)?,
         commands: commands.inbox()?,
         coordinator: Coordinator::new(scenario.clone(), zones.clone()),
+        in_force: zones.clone().map(|_| Vec::new()).collect(),
         pool: ControllerPool::new(scenario.clone(), zones),
         space: &space,
         world,
@@ -207,6 +219,8 @@ struct Kit<'a> {
     coordination: IoxOutbox<Assignment>,
     commands: IoxInbox<VehicleCommand>,
     coordinator: Coordinator,
+    /// By zone.
+    in_force: Vec<Vec<Assignment>>,
     pool: ControllerPool,
     world: World,
     run_id: u64,
@@ -236,6 +250,7 @@ impl Kit<'_> {
             Rule::Pause => step > PAUSE_AT,
             Rule::HardBraking => step >= BRAKE_TO,
             Rule::Restart => step > RESTART_AT,
+            Rule::CatchUp => step > GO_ON_AT,
             Rule::End => step >= END_AT,
             _ => self.answered > 0,
         }
@@ -260,8 +275,8 @@ impl Kit<'_> {
     /// Ends the controller, and whatever it started.
     fn stop(&mut self) {
         if let Some(mut child) = self.child.take() {
-            if let Some(group) = rustix::process::Pid::from_raw(child.id() as i32) {
-                let _ = rustix::process::kill_process_group(group, rustix::process::Signal::KILL);
+            if let Some(group) = Pid::from_raw(child.id() as i32) {
+                let _ = kill_process_group(group, Signal::KILL);
             }
             let _ = child.wait();
         }
@@ -277,7 +292,7 @@ impl Kit<'_> {
     fn admit(&mut self, rule: Rule) -> Result<bool, ProcessError> {
         let deadline = Instant::now() + JOIN;
         while !self.reception.is_ready(INDEX as usize) {
-            self.reception.serve(&mut |_, _, _| Readiness::Begin)?;
+            self.hand_over(None)?;
             if let Some(reason) = self.reception.last_refusal.take() {
                 let rule = if reason.contains("schema") { Rule::Schema } else { rule };
                 self.breach(rule, format!("attach request refused: {reason}"));
@@ -291,6 +306,16 @@ impl Kit<'_> {
             std::thread::sleep(Duration::from_millis(1));
         }
         Ok(true)
+    }
+
+    /// Answers whoever asks what is in force; a state that has been sent has all its coordination.
+    fn hand_over(&mut self, sent: Option<FrameHeader>) -> Result<(), ProcessError> {
+        let Kit { reception, in_force, world, .. } = self;
+        reception.serve(&mut |_, _, _| {
+            let (step, in_force) = (world.step(), in_force.concat());
+            Readiness::Now(Box::new(Handover { step, header: sent, in_force, ..Handover::default() }))
+        })?;
+        Ok(())
     }
 
     fn drive(&mut self) -> Result<(), ProcessError> {
@@ -320,6 +345,12 @@ impl Kit<'_> {
                     return Ok(());
                 }
             }
+            if step == STOP_AT {
+                if !self.leave_behind(&mut states)? {
+                    return Ok(());
+                }
+                continue;
+            }
             states.clear();
             states.extend(self.world.records());
             let sent = self.publish(&states)?;
@@ -328,6 +359,54 @@ impl Kit<'_> {
             }
         }
         self.finish()
+    }
+
+    /// Goes on for a while without the controller, which is stopped, and then waits a little at each step until
+    /// it answers the one at hand. `false` when there is no point in going on.
+    fn leave_behind(&mut self, states: &mut Vec<VehicleState>) -> Result<bool, ProcessError> {
+        self.signal(Signal::STOP);
+        loop {
+            let step = self.world.step();
+            if step == GO_ON_AT {
+                self.signal(Signal::CONT);
+            }
+            states.clear();
+            states.extend(self.world.records());
+            let sent = self.publish(states)?;
+            let header = self.header(Role::World, step);
+            while step >= GO_ON_AT && sent.elapsed() < CATCH_UP_STEP {
+                self.hand_over(Some(header))?;
+                match self.commands.receive()? {
+                    Some(frame) if frame.header().step == step => {
+                        self.take(frame, states)?;
+                        return Ok(true);
+                    }
+                    // Late.
+                    Some(_) => {}
+                    None => std::thread::sleep(Duration::from_micros(100)),
+                }
+                if let Some(how) = self.ended() {
+                    self.breach(Rule::CatchUp, how);
+                    return Ok(false);
+                }
+            }
+            if step == CAUGHT_UP_BY {
+                self.breach(Rule::CatchUp, format!("it answered no step at hand from step {GO_ON_AT} on"));
+                return Ok(false);
+            }
+            let substitute = self.substitute(states);
+            self.world.command(INDEX, &substitute).expect("the substitute is as it should be");
+            self.world.advance().expect("all vehicles have been commanded");
+        }
+    }
+
+    /// Stops the controller, and whatever it started, or lets them go on.
+    fn signal(&self, signal: Signal) {
+        let id = self.child.as_ref().and_then(|child| Pid::from_raw(child.id() as i32));
+        if let Some(group) = id {
+            // If it has ended, that is noticed soon enough.
+            let _ = kill_process_group(group, signal);
+        }
     }
 
     /// Plays world and coordinator for one step, and decides for the built-in pool.
@@ -344,6 +423,9 @@ impl Kit<'_> {
             let assignments = self.coordinator.assignments();
             // Both come from this process, so they cannot contradict each other.
             self.pool.coordinate(states, assignments).expect("our own coordination fits our own state");
+            for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
+                self.in_force[group[0].zone as usize] = group.to_vec();
+            }
             let header = FrameHeader { sender_role: Role::Coordinator as u16, ..header };
             let fill = assignments.iter().copied();
             self.coordination.loan(header, assignments.len(), |s| fill.for_each(|r| s.push(r)))?.send()?;
@@ -370,20 +452,23 @@ impl Kit<'_> {
         }
     }
 
-    /// Takes the controller's answer, or replaces it. `false` when there is no point in going on.
-    fn answer(&mut self, states: &[VehicleState], sent: Instant) -> Result<bool, ProcessError> {
-        let step = self.world.step();
+    /// What the kit puts in for the controller: accelerations of 0.
+    fn substitute(&self, states: &[VehicleState]) -> Vec<VehicleCommand> {
         let drivers = self.world.drivers();
         let is_own = |s: &&VehicleState| {
             s.zone != frames::NO_ZONE
                 && s.flags & frames::STATE_LEFT == 0
                 && drivers.of(s.zone, s.path) == INDEX
         };
-        let substitute: Vec<VehicleCommand> = states
-            .iter()
-            .filter(is_own)
-            .map(|s| VehicleCommand { vehicle: s.vehicle, zone: s.zone, ..VehicleCommand::default() })
-            .collect();
+        let own = states.iter().filter(is_own);
+        own.map(|s| VehicleCommand { vehicle: s.vehicle, zone: s.zone, ..VehicleCommand::default() })
+            .collect()
+    }
+
+    /// Waits for the controller's answer, and takes it. `false` when there is no point in going on.
+    fn answer(&mut self, states: &[VehicleState], sent: Instant) -> Result<bool, ProcessError> {
+        let step = self.world.step();
+        let substitute = self.substitute(states);
         let rule = match (step, substitute.is_empty()) {
             (PAUSE_AT, _) => Rule::Pause,
             (BRAKE_FROM..BRAKE_TO, _) => Rule::HardBraking,
@@ -419,6 +504,14 @@ impl Kit<'_> {
                 format!("took {:.1} ms, allowed are {:.1}", ms(took), ms(self.deadline)),
             );
         }
+        self.take(frame, states)?;
+        Ok(true)
+    }
+
+    /// Takes the controller's answer, or replaces it.
+    fn take(&mut self, frame: IoxFrame<VehicleCommand>, states: &[VehicleState]) -> Result<(), ProcessError> {
+        let step = self.world.step();
+        let substitute = self.substitute(states);
         let generation = self.reception.generation(INDEX as usize);
         let index = INDEX as u16;
         let expected =
@@ -469,7 +562,7 @@ impl Kit<'_> {
             self.world.command(INDEX, &records).expect("the substitute is as it should be");
         }
         self.world.advance().expect("all vehicles have been commanded");
-        Ok(true)
+        Ok(())
     }
 
     /// Says that the run is over, and waits for the controller to end.

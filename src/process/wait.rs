@@ -4,6 +4,7 @@ use super::placement::number_of_cores;
 use super::realtime::Breather;
 use super::{Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
+use crate::scenario::ControllerNames;
 use crate::transport::iox::Bell;
 use ipc_schemas::{Role, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
 use std::time::{Duration, Instant};
@@ -114,6 +115,7 @@ pub struct Waiter {
     bell: Option<Bell>,
     stop: StopFlag,
     peers: Peers,
+    names: ControllerNames,
     polls: u32,
     since: Option<Instant>,
     waited: Duration,
@@ -143,6 +145,7 @@ impl Waiter {
             bell,
             stop,
             peers,
+            names: ControllerNames::default(),
             polls: 0,
             since: None,
             waited: Duration::ZERO,
@@ -192,16 +195,23 @@ impl Waiter {
         }
         self.waited = self.since.get_or_insert_with(Instant::now).elapsed();
         if self.waited >= self.patience.timeout {
+            let awaited = awaited.named(&self.names);
             return Err(ProcessError::Timeout { awaited, seconds: self.patience.timeout.as_secs_f64() });
         }
         if self.waited >= self.peers_checked + PEER_CHECK {
             self.peers_checked = self.waited;
             if let Some(peer) = self.peers.first_gone() {
-                let consequence = format!("this one was waiting for {awaited}");
-                return Err(ProcessError::PeerGone { peer, consequence });
+                let consequence = format!("this one was waiting for {}", awaited.named(&self.names));
+                let name = peer.name(&self.names);
+                return Err(ProcessError::PeerGone { peer, name, consequence });
             }
         }
         Ok(())
+    }
+
+    /// What to call controllers from now on.
+    pub fn call(&mut self, names: ControllerNames) {
+        self.names = names;
     }
 
     /// Whom to look after from now on.
@@ -241,7 +251,8 @@ impl Waiter {
         let deadline = Instant::now() + LEAVING;
         loop {
             if let Some(peer) = self.peers.first_gone() {
-                return ProcessError::PeerGone { peer, consequence: error.to_string() };
+                let name = peer.name(&self.names);
+                return ProcessError::PeerGone { peer, name, consequence: error.to_string() };
             }
             if Instant::now() >= deadline {
                 return error.into();

@@ -151,6 +151,7 @@ pub fn run_world(
     }
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
     let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
+    waiter.call(driver.names());
     for Peer { role, index, process_id } in reception.peers().0 {
         driver.seat(role, index, Seat::new(0, process_id));
     }
@@ -175,7 +176,7 @@ pub fn run_world(
         }
         match driver.advance().map_err(|error| waiter.explain(error))? {
             Progress::Finished => {
-                history.punctuality = house.pacer.report();
+                history.punctuality = house.pacer.report(&driver.names());
                 history.refused = driver.refused();
                 history.late_frames = driver.late_frames();
                 return Ok(meter.outcome(driver.world(), history));

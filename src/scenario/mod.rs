@@ -30,7 +30,7 @@ pub use params::{
     Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
     Segment, Solver, VehicleParams,
 };
-pub use plugins::{Drivers, Plugin, ShieldMode};
+pub use plugins::{ControllerNames, Drivers, Plugin, ShieldMode};
 
 use serde::{Deserialize, Serialize};
 

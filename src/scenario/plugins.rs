@@ -115,6 +115,28 @@ impl Drivers {
     }
 }
 
+/// What the controllers of a run are called in messages: those written elsewhere as the user named them, the others
+/// by their number.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ControllerNames {
+    pool: u32,
+    plugins: Vec<String>,
+}
+
+impl ControllerNames {
+    /// The names in a run with so many controller processes in all.
+    pub fn new(scenario: &Scenario, controllers: u32) -> ControllerNames {
+        let plugins: Vec<String> = scenario.plugins.iter().map(|p| p.name.clone()).collect();
+        ControllerNames { pool: controllers.saturating_sub(plugins.len() as u32), plugins }
+    }
+
+    /// What to call a controller.
+    pub fn of(&self, index: u32) -> String {
+        let plugin = index.checked_sub(self.pool).and_then(|i| self.plugins.get(i as usize));
+        plugin.map_or_else(|| format!("controller {index}"), |name| format!("controller {name}"))
+    }
+}
+
 impl Scenario {
     /// Whether an approach is driven by a plug-in.
     pub fn is_plugged(&self, zone: ZoneId, path: u32) -> bool {

@@ -5,13 +5,14 @@ A controller is a function from a view of one zone to one acceleration per vehic
     import control_zones
 
     def cruise(zone):
-        return 15.0 - zone.v
+        spec = zone.run.spec
+        return (15.0 - zone.v).clip(spec.u_min_mps2, spec.u_max_mps2)
 
     control_zones.run(cruise)
 
 Start it with `cz run --controller merge-2="python3 cruise.py"`. The loop, joining the run and the checks of
-every frame are in `run`; `Session` is the same without a loop. Arrays are numpy views of shared memory
-where numpy is installed, and lists where it is not.
+every frame are in `run`; `Session` is the same without a loop. Arrays are read-only numpy arrays, copies that
+may be kept, where numpy is installed, and lists where it is not.
 """
 
 from . import _schemas as schemas

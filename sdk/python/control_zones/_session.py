@@ -7,18 +7,25 @@ import random
 import re
 import shutil
 import stat
+import sys
 import time
 
 import iceoryx2
 
 from . import _schemas as s
-from ._view import Partners, ZoneView, as_array
+from ._view import Partners, ZoneView, frozen, structured
 
 #: Seconds of polling before sleeping between polls.
 _BUSY_S = 0.002
 _NAP_S = 0.0001
 #: The file in a run's directory by which it is known.
 _MARKER = ".cz-run"
+#: Seconds after which an unanswered request is repeated.
+_REPEAT_S = 0.1
+#: Frames looked at in one go; after that whoever waits looks at its clock.
+_AT_ONCE = 16
+#: Accounts of refused frames are kept for this many senders; the rest share one.
+_MAX_ACCOUNTS = 16
 
 
 class Error(Exception):
@@ -153,11 +160,13 @@ class Session:
             wanted_index=s.ANY_INDEX,
             phase=s.ATTACH_JOIN,
         )
+        self._joined = None
         reply, data = self._exchange(request, deadline, late)
         if reply.status != s.ATTACH_ACCEPTED:
             raise Error(f"the world refused controller {controller}: {data.decode()}")
         self.reply = reply
         self.run = Run(data, reply.index)
+        self._joined = data
         # The services are opened only now, when both sides are known to mean the same by them.
         self._states = self._service_of(s.SERVICE_STATE, s.VehicleState).subscriber_builder().create()
         self._coordination = self._service_of(s.SERVICE_COORDINATION, s.Assignment).subscriber_builder().create()
@@ -166,17 +175,24 @@ class Session:
             .publisher_builder()
             .initial_max_slice_len(64)
             .allocation_strategy(iceoryx2.AllocationStrategy.PowerOfTwo)
+            # A world that has gone on may have no room for late answers, and does not want them.
+            .backpressure_strategy(iceoryx2.BackpressureStrategy.DiscardData)
             .max_loaned_samples(1)
             .create()
         )
         request.phase = s.ATTACH_READY
         request.index = reply.index
-        self._exchange(request, deadline, late)
-        self._next_step = reply.first_step
-        self._state = None
-        self._missing = 0
+        self._request = request
         self._assignments = {zone: [] for zone in self.run.own_zones}
         self._partners = {}
+        # The first step whose coordination is not in force yet.
+        self._next_step = 0
+        self._ask_again_at = None
+        self._state = None
+        self._complete = False
+        self._world_port = None
+        self._refused = {}
+        self._restore(*self._exchange(request, deadline, late))
 
     def _service(self, name, record, header):
         builder = self._node.service_builder(iceoryx2.ServiceName.new(name)).publish_subscribe(record)
@@ -190,20 +206,50 @@ class Session:
         while True:
             if time.monotonic() >= repeat_at:
                 self._requests.send_copy(request)
-                repeat_at = time.monotonic() + 0.1
-            while (sample := self._replies.receive()) is not None:
-                header = sample.user_header().contents
-                if header.instance == request.instance:
-                    reply = s.AttachReply.from_buffer_copy(header)
-                    return reply, bytes(s.records(sample, ctypes.c_uint8))
+                repeat_at = time.monotonic() + _REPEAT_S
+            found = self._reply(request.instance)
+            if found is not None:
+                return found
             _pause(deadline, late)
+
+    def _reply(self, instance):
+        """The next reply to this controller, and the bytes behind it, if one has come."""
+        while (sample := self._replies.receive()) is not None:
+            reply = s.AttachReply.from_buffer_copy(sample.user_header().contents)
+            data = bytes(s.records(sample, ctypes.c_uint8))
+            # Whoever had to repeat the first request gets its reply again, sooner or later.
+            if reply.instance == instance and data != self._joined:
+                return reply, data
+        return None
+
+    def _restore(self, reply, data):
+        """Takes the assignments in force from a reply."""
+        if reply.status != s.ATTACH_ACCEPTED:
+            raise Error(f"the world refused this controller: {data.decode(errors='replace')}")
+        count, rest = divmod(len(data), ctypes.sizeof(s.Assignment))
+        if rest:
+            raise Error(f"the world's reply has {len(data)} bytes, which are no assignments")
+        self._next_step = reply.first_step
+        self._assignments = {zone: [] for zone in self.run.own_zones}
+        self._partners = {}
+        self._coordinate((s.Assignment * count).from_buffer_copy(data))
+
+    def _coordinate(self, records):
+        """Replaces the coordination of the zones that these are for."""
+        changed = {}
+        for record in records:
+            if record.zone in self._assignments:
+                changed.setdefault(record.zone, []).append(record)
+        for zone, assignments in changed.items():
+            self._assignments[zone] = assignments
+            self._partners.pop(zone, None)
 
     def wait(self, timeout=None):
         """Waits for a step: True when there is one to be answered, False at the end of the run.
 
         Raises `TimeoutError` when nothing came for `timeout` seconds.
         """
-        if self._state is not None and not self._missing:
+        if self._complete:
             return True
         start = checked = time.monotonic()
         polls = 0
@@ -220,79 +266,156 @@ class Session:
                 raise TimeoutError(f"nothing came for {timeout} s")
             if now - checked >= 0.05:
                 checked = now
-                if not _alive(self.reply.world_process_id) and (ready := self._poll()) is None:
-                    raise Error(f"the world (process {self.reply.world_process_id}) has ended")
+                if not _alive(self.reply.world_process_id):
+                    # Its last frame may have come in the meantime.
+                    if (ready := self._poll()) is not None:
+                        return ready
+                    raise Error(f"the world (process {self.reply.world_process_id}) has ended without an end of the run")
             if now - start >= _BUSY_S:
                 time.sleep(_NAP_S)
 
     def _poll(self):
-        if self._state is None:
-            sample = self._states.receive()
-            if sample is None:
+        """Does what can be done now: True for a step to be answered, False at the end, None to go on waiting."""
+        if self._ask_again_at is not None:
+            found = self._reply(self._request.instance)
+            if found is not None:
+                self._ask_again_at = None
+                self._restore(*found)
+        if self._take_states():
+            return False
+        state = self._state
+        if state is None:
+            return None
+        step = state.header.step
+        if step > self._next_step:
+            # Steps have passed without this controller, and with them perhaps coordination.
+            self._catch_up()
+            return None
+        if step == self._next_step:
+            self._take_coordination(state)
+            if state.missing:
                 return None
-            header = sample.user_header().contents
-            self._check(header, s.ROLE_WORLD)
-            if header.flags & s.FLAG_END_OF_RUN:
-                return False
-            self._state = sample
-            self._missing = header.coordinators_acting
-            self._changed = set()
-        while self._missing:
-            sample = self._coordination.receive()
-            if sample is None:
-                return None
-            header = sample.user_header().contents
-            self._check(header, s.ROLE_COORDINATOR)
-            for record in s.records(sample, s.Assignment):
-                if record.zone in self._assignments:
-                    if record.zone not in self._changed:
-                        self._changed.add(record.zone)
-                        self._assignments[record.zone] = []
-                    self._assignments[record.zone].append(s.Assignment.from_buffer_copy(record))
-            self._missing &= ~(1 << header.sender_index)
+        # Otherwise its coordination is in force already.
+        self._next_step = max(self._next_step, step + 1)
+        self._complete = True
         return True
 
-    def _check(self, header, role):
+    def _take_states(self):
+        """Takes the newest state; an older one would be answered too late. Whether the run is over."""
+        for _ in range(_AT_ONCE):
+            sample = self._states.receive()
+            if sample is None:
+                break
+            # Copied before it is judged: what was judged is what is used, and may be kept.
+            header = s.FrameHeader.from_buffer_copy(sample.user_header().contents)
+            fault = self._fault(header, sample, s.ROLE_WORLD, s.VehicleState)
+            if fault is None and (header.sender_index, header.generation) != (0, 0):
+                fault = "its sender_index or generation is not the world's"
+            if fault is None and self._world_port != (port := sample.header.publisher_id.value):
+                if (process := _process_of(sample)) != self.reply.world_process_id:
+                    fault = f"it was sent by process {process}; the world is {self.reply.world_process_id}"
+                else:
+                    self._world_port = port
+            if fault is not None:
+                self._refuse(header, sample, fault)
+                continue
+            if header.flags & s.FLAG_END_OF_RUN:
+                return True
+            newest = 0 if self._state is None else self._state.header.step
+            # Of the step before the next one, the coordination is known: it may still be answered.
+            if header.step >= newest and header.step + 1 >= self._next_step:
+                self._state = _State(header, sample)
+        if self._state is not None and self._state.header.step + 1 < self._next_step:
+            self._state = None
+        return False
+
+    def _take_coordination(self, state):
+        """Takes coordination of the step at hand, as far as it has come."""
+        for _ in range(_AT_ONCE):
+            if not state.missing:
+                break
+            sample = self._coordination.receive()
+            if sample is None:
+                break
+            header = s.FrameHeader.from_buffer_copy(sample.user_header().contents)
+            records = _copied(sample, s.Assignment)
+            fault = self._fault(header, sample, s.ROLE_COORDINATOR, s.Assignment)
+            if fault is None and header.sender_index >= min(self.reply.coordinators, 64):
+                fault = f"the run has {self.reply.coordinators} coordinators"
+            foreign = next((r.zone for r in records if r.zone >= self.run.spec.zones), None)
+            if fault is None and foreign is not None:
+                fault = f"there is no zone {foreign}"
+            if fault is not None:
+                self._refuse(header, sample, fault)
+            # Otherwise it is late, or of a step to come, or has come twice.
+            elif header.step == self._next_step and state.missing >> header.sender_index & 1:
+                self._coordinate(records)
+                state.missing &= ~(1 << header.sender_index)
+
+    def _catch_up(self):
+        """Asks for the coordination in force, and again while no answer comes."""
+        now = time.monotonic()
+        if self._ask_again_at is not None:
+            if now < self._ask_again_at:
+                return
+        else:
+            # What lies here is older than what the answer will say; it would only be in the way.
+            for _ in range(_AT_ONCE):
+                if self._coordination.receive() is None:
+                    break
+            while self._reply(self._request.instance) is not None:
+                pass
+        request = s.AttachRequest.from_buffer_copy(self._request)
+        request.phase = s.ATTACH_RESTORE
+        self._requests.send_copy(request)
+        self._ask_again_at = now + _REPEAT_S
+
+    def _fault(self, header, sample, role, record):
+        """What is wrong with the header of a frame, if anything is."""
         for field, expected in (
             ("schema_hash", s.SCHEMA_HASH),
             ("run_id", self.reply.run_id),
             ("sender_role", role),
-            ("step", self._next_step),
+            ("record_count", sample.header.number_of_elements),
         ):
             found = getattr(header, field)
             if found != expected:
-                raise Error(f"step {self._next_step}: a frame has {field} = {found}, expected {expected}")
+                return f"it has {field} = {found}, expected {expected}"
+        return None
+
+    def _refuse(self, header, sample, fault):
+        key = header.sender_role, header.sender_index, sample.header.publisher_id.value
+        if key not in self._refused and len(self._refused) >= _MAX_ACCOUNTS:
+            key = next(reversed(self._refused))
+        sender, frames, _ = self._refused.get(key) or (_claim(header, _process_of(sample)), 0, None)
+        self._refused[key] = sender, frames + 1, fault
+
+    def refused(self):
+        """What was refused, in words: one line per sender."""
+        return [f"refused {n} frames of {sender}; the last: {last}" for sender, n, last in self._refused.values()]
+
+    @property
+    def step(self):
+        """Number of the step to be answered; None while there is none."""
+        return self._state.header.step if self._complete else None
 
     def answer(self, controller):
-        """Answers the step: calls `controller(view)` for each of its zones and sends what it returns."""
-        sample = self._state
-        if sample is None or self._missing:
+        """Answers the step: calls `controller(view)` for each of its zones and sends what it returns.
+
+        An answer that comes too late is dropped: the next step is another chance.
+        """
+        if not self._complete:
             raise Error("there is no step to answer; wait for one first")
-        header = sample.user_header().contents
-        states = s.records(sample, s.VehicleState)
+        header, states, frame = self._state.header, self._state.records, self._state.frame
         zones = self._own(states)
         count = sum(len(own) for _, _, own in zones)
-        loan = self._commands.loan_slice_uninit(count)
-        out = loan.user_header().contents
-        ctypes.memset(ctypes.addressof(out), 0, ctypes.sizeof(out))
-        out.run_id = self.reply.run_id
-        out.schema_hash = s.SCHEMA_HASH
-        out.step = self._next_step
-        out.time_ns = header.time_ns
-        out.sender_role = s.ROLE_CONTROLLER
-        out.sender_index = self.reply.index
-        out.generation = self.reply.generation
-        out.record_count = count
-        commands = s.records(loan, s.VehicleCommand)
-        if count:
-            ctypes.memset(loan.payload_ptr, 0, ctypes.sizeof(commands))
-        frame = as_array(states) if len(states) else states
-        records = as_array(commands) if count else commands
+        commands = (s.VehicleCommand * count)()
+        records = structured(commands)
         at = 0
         for zone, (start, end), own in zones:
             if not own:
                 continue
-            if zone in self._changed or zone not in self._partners:
+            if zone not in self._partners:
                 local = [i - start for i in own]
                 self._partners[zone] = Partners(states[start:end], local, self._assignments[zone])
             contiguous = own[-1] - own[0] + 1 == len(own)
@@ -305,25 +428,42 @@ class Session:
                 command.mode = s.MODE_OCBF
             name = self.run.zone_names[zone]
             partners = self._partners[zone]
-            view = ZoneView(self.run, zone, name, header, frame[start:end], places, partners, part)
-            u = controller(view)
-            if len(u) != len(own):
-                raise Error(f"step {self._next_step}: {len(u)} accelerations for {len(own)} vehicles")
-            for k in range(len(own)):
-                commands[at + k].u_mps2 = u[k]
+            view = ZoneView(self.run, zone, name, header, frozen(frame[start:end]), places, partners, part)
+            for k, u in enumerate(_accelerations(controller, view, len(own))):
+                commands[at + k].u_mps2 = u
             at += len(own)
-        # Every reference into the frames goes before they do.
-        view = part = records = frame = commands = states = out = header = None
+        self._send(header, commands)
+
+    def _send(self, header, commands):
+        # Lent only now, so that a controller that fails leaves nothing on loan.
+        loan = self._commands.loan_slice_uninit(len(commands))
+        out = loan.user_header().contents
+        ctypes.memset(ctypes.addressof(out), 0, ctypes.sizeof(out))
+        out.run_id = self.reply.run_id
+        out.schema_hash = s.SCHEMA_HASH
+        out.step = header.step
+        out.time_ns = header.time_ns
+        out.sender_role = s.ROLE_CONTROLLER
+        out.sender_index = self.reply.index
+        out.generation = self.reply.generation
+        out.record_count = len(commands)
+        if len(commands):
+            ctypes.memmove(loan.payload_ptr, commands, ctypes.sizeof(commands))
+        out = None
         reached = loan.assume_init().send()
         self._state = None
-        if reached == 0:
-            raise Error("the world has gone")
-        self._next_step += 1
+        self._complete = False
+        # Nobody has room for an answer that is too late, and nobody is there once the world has gone.
+        if reached == 0 and not _alive(self.reply.world_process_id):
+            raise Error(f"the world (process {self.reply.world_process_id}) has ended without an end of the run")
 
     def close(self):
         """Leaves the run. Whoever leaves last removes what iceoryx2 leaves behind."""
         if self._node is None:
             return
+        # There is no summary in which it could stand.
+        for line in self.refused():
+            print(line, file=sys.stderr)
         self._state = self._states = self._coordination = self._commands = None
         self._replies = self._requests = self._node = None
         try:
@@ -368,6 +508,57 @@ class Session:
             if not state.flags & s.STATE_LEFT and (state.zone, state.path) in drives:
                 entry[2].append(i)
         return [(zone, (start or 0, end), own) for zone, (start, end, own) in zones.items()]
+
+
+class _State:
+    """A state to be answered: copies, so that nothing of it lies where others write."""
+
+    def __init__(self, header, sample):
+        self.header = header
+        self.records = _copied(sample, s.VehicleState)
+        self.frame = structured(self.records)
+        # Coordinators whose frame of this step is still to come.
+        self.missing = header.coordinators_acting
+
+
+def _copied(sample, record):
+    size = sample.header.number_of_elements * ctypes.sizeof(record)
+    data = ctypes.string_at(sample.payload_ptr, size)
+    return (record * sample.header.number_of_elements).from_buffer_copy(data)
+
+
+def _process_of(sample):
+    """The process of a frame's sender, as the transport names it."""
+    return sample.header.node_id.pid(iceoryx2.ServiceType.Ipc)
+
+
+def _claim(header, process):
+    role = {s.ROLE_WORLD: "world", s.ROLE_COORDINATOR: "coordinator", s.ROLE_CONTROLLER: "controller"}
+    name = role.get(header.sender_role, f"a sender of unknown role {header.sender_role},")
+    return f"{name} {header.sender_index} (process {process})"
+
+
+def _accelerations(controller, view, count):
+    """What the controller decides for a zone, as numbers; if it cannot be, what to do about it."""
+    where = f"step {view.step}, zone {view.name}"
+    try:
+        u = controller(view)
+    except ValueError as error:
+        if "read-only" not in str(error):
+            raise
+        raise Error(
+            f"{where}: the arrays of a zone are read-only; make one of your own, such as `err = zone.v - 15` "
+            "or `v = zone.v.copy()`"
+        ) from error
+    expected = f"expected {count} accelerations, one per vehicle"
+    try:
+        numbers = [float(number) for number in u]
+    except (TypeError, ValueError) as error:
+        kind = "None" if u is None else f"a {type(u).__name__}"
+        raise Error(f"{where}: the controller returned {kind}; {expected}") from error
+    if len(numbers) != count:
+        raise Error(f"{where}: the controller returned {len(numbers)} accelerations; {expected}")
+    return numbers
 
 
 def _forget(remove, path):

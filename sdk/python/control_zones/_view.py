@@ -15,8 +15,9 @@ _LEFT = s.STATE_LEFT
 class ZoneView:
     """One zone in one step, as far as this controller drives it.
 
-    Arrays have one element per vehicle to be commanded, in passing order. They are valid until the
-    function returns: they lie in the frame, which then goes back to the world.
+    Arrays have one element per vehicle to be commanded, in passing order. They are copies, may be kept as long
+    as one likes, and are read-only: what a function changed would be changed for whoever looks next. Make an
+    array of your own where you need one: `err = zone.v - 15` or `v = zone.v.copy()`. Without numpy they are lists.
 
     Attributes:
         run: the run (`run.spec` has limits, gains and the step length).
@@ -33,8 +34,8 @@ class ZoneView:
             in the vehicle's own coordinate; NaN where there is none.
         merge_at: distance of the conflict point on the vehicle's own path, m.
         states: all records of the zone, index 0 (the vehicle that left it last) included.
-        commands: the records being written; `u_mps2` is filled from what the function returns, other
-            fields, such as the planned exit, may be set here.
+        commands: the records that will be sent, the only array to be written to; `u_mps2` is filled from what
+            the function returns, other fields, such as the planned exit, may be set here.
     """
 
     def __init__(self, run, zone, name, header, states, own, partners, commands):
@@ -53,11 +54,21 @@ class ZoneView:
     def __len__(self):
         return len(self.commands)
 
+    def _once(self, key, make):
+        if key not in self._cache:
+            self._cache[key] = frozen(make())
+        return self._cache[key]
+
     def _field(self, name):
-        if numpy is not None:
-            return self.states[name][self._own]
-        places = range(*self._own.indices(len(self.states))) if isinstance(self._own, slice) else self._own
-        return [getattr(self.states[i], name) for i in places]
+        def own():
+            if numpy is not None:
+                # A copy, so that whoever keeps it does not keep all records.
+                return numpy.array(self.states[name][self._own])
+            own = self._own
+            places = range(*own.indices(len(self.states))) if isinstance(own, slice) else own
+            return [getattr(self.states[i], name) for i in places]
+
+        return self._once(name, own)
 
     vehicle = property(lambda self: self._field("vehicle"))
     path = property(lambda self: self._field("path"))
@@ -70,11 +81,11 @@ class ZoneView:
     @property
     def length(self):
         lengths = self.run.lengths[self.zone]
-        return _array([lengths[path] for path in self.path])
+        return self._once("length", lambda: _array([lengths[path] for path in self.path]))
 
     @property
     def terminal(self):
-        return _array(self._partners.terminal)
+        return self._once("terminal", lambda: _array(self._partners.terminal))
 
     ahead_x = property(lambda self: self._partner("ahead", "x_m"))
     ahead_v = property(lambda self: self._partner("ahead", "v_mps"))
@@ -85,27 +96,24 @@ class ZoneView:
 
     @property
     def merge_at(self):
-        return _array(self._partners.merge_at)
+        return self._once("merge_at", lambda: _array(self._partners.merge_at))
 
     def _partner(self, kind, field):
-        key = kind, field
-        if key not in self._cache:
+        def partners():
             p = self._partners
             places = p.ahead if kind == "ahead" else p.merge
-            if numpy is not None:
-                places = numpy.asarray(places, dtype=int)
-                values = numpy.full(len(places), NAN)
-                there = places >= 0
-                values[there] = self.states[field][places[there]]
-                if kind == "merge" and field == "x_m":
-                    values += numpy.asarray(p.merge_shift)
-            else:
-                shift = p.merge_shift if kind == "merge" and field == "x_m" else [0.0] * len(places)
-                values = [
-                    getattr(self.states[i], field) + d if i >= 0 else NAN for i, d in zip(places, shift)
+            shifts = p.merge_shift if kind == "merge" and field == "x_m" else [0.0] * len(places)
+            if numpy is None:
+                return [
+                    getattr(self.states[i], field) + shift if i >= 0 else NAN for i, shift in zip(places, shifts)
                 ]
-            self._cache[key] = values
-        return self._cache[key]
+            places = numpy.asarray(places, dtype=int)
+            values = numpy.full(len(places), NAN)
+            there = places >= 0
+            values[there] = self.states[field][places[there]]
+            return values + numpy.asarray(shifts)
+
+        return self._once((kind, field), partners)
 
 
 class Partners:
@@ -130,17 +138,28 @@ class Partners:
             if not a.flags & s.ASSIGNMENT_FREE_TERMINAL:
                 self.terminal[k] = a.terminal_speed_mps
             if a.kind == s.CONSTRAINT_REAR_END:
-                self.ahead[k] = places[a.partner]
+                self.ahead[k] = places.get(a.partner, -1)
             elif a.kind == s.CONSTRAINT_MERGE:
-                self.merge[k] = places[a.partner]
+                self.merge[k] = places.get(a.partner, -1)
                 self.merge_shift[k] = a.own_conflict_m - a.partner_conflict_m
                 self.merge_at[k] = a.own_conflict_m
 
 
 def _array(values):
-    return values if numpy is None else numpy.asarray(values, dtype=float)
+    return list(values) if numpy is None else numpy.array(values, dtype=float)
 
 
-def as_array(records):
+def structured(records):
     """A ctypes array of records as a numpy structured array over the same memory, where there is numpy."""
-    return records if numpy is None else numpy.ctypeslib.as_array(records)
+    if numpy is None:
+        return records
+    if not len(records):
+        return numpy.zeros(0, dtype=numpy.dtype(records._type_))
+    return numpy.ctypeslib.as_array(records)
+
+
+def frozen(values):
+    """The same, refusing to be written to, where that can be said of it."""
+    if numpy is not None and isinstance(values, numpy.ndarray):
+        values.setflags(write=False)
+    return values

@@ -10,7 +10,7 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::ServiceName;
 use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError as Open;
 use iceoryx2::service::ipc;
-use ipc_schemas::{self as frames, ApproachSpec, AttachReply, AttachRequest, Record, RunSpec};
+use ipc_schemas::{self as frames, ApproachSpec, Assignment, AttachReply, AttachRequest, Record, RunSpec};
 use std::time::{Duration, Instant};
 
 const LOOK: Duration = Duration::from_millis(2);
@@ -21,6 +21,8 @@ pub(crate) struct Line {
     requests: Publisher<ipc::Service, AttachRequest, ()>,
     replies: Subscriber<ipc::Service, [u8], AttachReply>,
     request: AttachRequest,
+    /// What came behind the reply to the first request; whoever had to repeat that gets it again, sooner or later.
+    joined: Vec<u8>,
     deadline: Instant,
     options: Options,
 }
@@ -65,13 +67,14 @@ pub(crate) fn join(options: &Options) -> Result<(Space, Line, AttachReply, Run),
         phase: frames::ATTACH_JOIN,
         index: 0,
     };
-    let line = Line { requests, replies, request, deadline, options: options.clone() };
+    let joined = Vec::new();
+    let mut line = Line { requests, replies, request, joined, deadline, options: options.clone() };
     let (reply, bytes) = line.exchange(request)?;
     if reply.status != frames::ATTACH_ACCEPTED {
-        let reason = String::from_utf8_lossy(&bytes).into_owned();
-        return Err(Error::Refused { controller: options.controller.clone(), reason });
+        return Err(line.refused(&bytes));
     }
     let run = read_run(&bytes, reply.index)?;
+    line.joined = bytes;
     Ok((space, line, reply, run))
 }
 
@@ -105,11 +108,53 @@ fn services(node: &Node<ipc::Service>) -> Result<Option<Pair>, Error> {
     Ok(Some((publisher, subscriber)))
 }
 
+/// From which step on coordination is still to come, and the assignments in force until then.
+pub(crate) type InForce = (u64, Vec<Assignment>);
+
 impl Line {
     /// Tells the world that all services are open.
-    pub(crate) fn ready(&self, index: u32) -> Result<(), Error> {
+    pub(crate) fn ready(&self, index: u32) -> Result<InForce, Error> {
         let request = AttachRequest { phase: frames::ATTACH_READY, index, ..self.request };
-        self.exchange(request).map(|_| ())
+        let (reply, bytes) = self.exchange(request)?;
+        self.in_force(&reply, &bytes)
+    }
+
+    /// Asks for what was missed while the run went on without this controller; [`caught_up`](Self::caught_up)
+    /// has the answer.
+    pub(crate) fn catch_up(&self, index: u32) -> Result<(), Error> {
+        let request = AttachRequest { phase: frames::ATTACH_RESTORE, index, ..self.request };
+        self.requests.send_copy(request).map_err(|e| failed("send an attach request", &e))?;
+        Ok(())
+    }
+
+    /// The next answer to that, if one has come.
+    pub(crate) fn caught_up(&self) -> Result<Option<InForce>, Error> {
+        let reply = self.reply()?;
+        reply.map(|(reply, bytes)| self.in_force(&reply, &bytes)).transpose()
+    }
+
+    /// The next reply to this controller, if one has come, that is not the first one again.
+    pub(crate) fn reply(&self) -> Result<Option<(AttachReply, Vec<u8>)>, Error> {
+        while let Some(sample) = self.replies.receive().map_err(|e| failed("receive a reply", &e))? {
+            let is_own = sample.user_header().instance == self.request.instance;
+            if is_own && (self.joined.is_empty() || self.joined != sample.payload()) {
+                return Ok(Some((*sample.user_header(), sample.payload().to_vec())));
+            }
+        }
+        Ok(None)
+    }
+
+    fn in_force(&self, reply: &AttachReply, bytes: &[u8]) -> Result<InForce, Error> {
+        if reply.status != frames::ATTACH_ACCEPTED {
+            return Err(self.refused(bytes));
+        }
+        let assignments = frames::records_from(bytes).ok_or(Error::BadReply(bytes.len()))?;
+        Ok((reply.first_step, assignments))
+    }
+
+    fn refused(&self, reason: &[u8]) -> Error {
+        let controller = self.options.controller.clone();
+        Error::Refused { controller, reason: String::from_utf8_lossy(reason).into_owned() }
     }
 
     /// Repeats a request until its reply comes.
@@ -121,10 +166,8 @@ impl Line {
                 self.requests.send_copy(request).map_err(|e| failed("send an attach request", &e))?;
                 repeat_at = now + REPEAT;
             }
-            while let Some(sample) = self.replies.receive().map_err(|e| failed("receive a reply", &e))? {
-                if sample.user_header().instance == request.instance {
-                    return Ok((*sample.user_header(), sample.payload().to_vec()));
-                }
+            if let Some(reply) = self.reply()? {
+                return Ok(reply);
             }
             if now >= self.deadline {
                 let seconds = self.options.attach_timeout.as_secs_f64();
@@ -139,13 +182,7 @@ impl Line {
 fn read<R: Record>(bytes: &mut &[u8]) -> Option<R> {
     let (front, rest) = bytes.split_at_checked(R::LAYOUT.size)?;
     *bytes = rest;
-    let mut record = R::default();
-    // SAFETY: a record is plain scalars without padding (`record!` proves it), so any bytes make a valid
-    // one; `front` has exactly its size and cannot overlap a local.
-    unsafe {
-        std::ptr::copy_nonoverlapping(front.as_ptr(), (&raw mut record).cast::<u8>(), front.len());
-    }
-    Some(record)
+    frames::records_from(front)?.first().copied()
 }
 
 fn read_run(all: &[u8], index: u32) -> Result<Run, Error> {
@@ -162,10 +199,8 @@ fn read_run(all: &[u8], index: u32) -> Result<Run, Error> {
         .zip(text.lines())
         .map(|(spec, name)| Approach { spec, name: name.to_owned() })
         .collect();
-    // Whoever has an approach is looked up by zone.
-    let zones_exist = approaches.iter().all(|a| a.spec.zone < spec.zones) && spec.zones <= spec.approaches;
-    if approaches.len() != spec.approaches as usize || !zones_exist {
+    if approaches.len() != spec.approaches as usize {
         return Err(bad());
     }
-    Ok(Run { spec, approaches, index })
+    Run::new(spec, approaches, index).ok_or_else(bad)
 }

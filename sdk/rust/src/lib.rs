@@ -1,21 +1,7 @@
 //! A controller for Control Zones: implement [`Controller`], call [`run`].
 //!
 //! ```no_run
-//! use control_zones_plugin::{Controller, Step, run};
-//!
-//! struct Cruise;
-//!
-//! impl Controller for Cruise {
-//!     fn step(&mut self, step: &Step<'_>, u_mps2: &mut [f64]) {
-//!         for (u, vehicle) in u_mps2.iter_mut().zip(step.vehicles()) {
-//!             *u = 15.0 - vehicle.state.v_mps;
-//!         }
-//!     }
-//! }
-//!
-//! fn main() -> Result<(), control_zones_plugin::Error> {
-//!     run(&mut Cruise)
-//! }
+#![doc = include_str!("../examples/cruise.rs")]
 //! ```
 //!
 //! Started by `cz run --controller merge-2=PROGRAM`, or by hand with `CZ_RUN` and `CZ_CONTROLLER` set. The
@@ -23,15 +9,17 @@
 //! that have one of their own.
 
 mod attach;
+mod inbox;
 mod session;
 mod space;
 mod view;
 
+pub use inbox::Refused;
 pub use ipc_schemas as schemas;
 pub use session::{Commands, Session, Wake};
 pub use view::{Approach, Partner, Run, Step, Vehicle};
 
-use ipc_schemas::{HeaderFault, VehicleCommand};
+use ipc_schemas::VehicleCommand;
 use std::time::Duration;
 
 /// Why a plug-in cannot go on.
@@ -59,16 +47,10 @@ pub enum Error {
     /// The world is no longer there.
     #[error("the world (process {0}) has ended without an end of the run")]
     WorldGone(u32),
-    /// A frame is not what the contract promises.
-    #[error("frame of step {step}: {fault}")]
-    Frame {
-        /// Step expected.
-        step: u64,
-        /// What is wrong.
-        fault: HeaderFault,
-    },
     /// The reply to the attach request cannot be read.
-    #[error("the world's reply has {0} bytes, which is not a run specification")]
+    #[error(
+        "the world's reply has {0} bytes, which are not what it should say; build both from the same version"
+    )]
     BadReply(usize),
     /// A call came at the wrong time, such as a send without a step to answer.
     #[error("{0}")]

@@ -1,19 +1,17 @@
 //! One attachment to a run, step by step.
 
 use crate::attach::{self, name};
+use crate::inbox::{Frame, Inbox, Refusal, Refusals, Refused};
 use crate::space::{Space, failed};
-use crate::view::{Run, Step, is_member};
+use crate::view::{Board, Run, Step};
 use crate::{Error, Options};
-use iceoryx2::node::Node;
 use iceoryx2::port::BackpressureAction;
 use iceoryx2::port::publisher::Publisher;
-use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::AllocationStrategy;
-use iceoryx2::sample::Sample;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::ipc;
 use ipc_schemas::{
-    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, Record, Role,
+    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, Role,
     VehicleCommand, VehicleState,
 };
 use std::time::{Duration, Instant};
@@ -34,25 +32,40 @@ const BUSY: Duration = Duration::from_millis(2);
 const NAP: Duration = Duration::from_micros(100);
 const LIFE_CHECK: Duration = Duration::from_millis(50);
 
+/// Time after which an unanswered request is repeated.
+const REPEAT: Duration = Duration::from_millis(100);
+/// Frames looked at in one go; after that whoever waits looks at its clock.
+const AT_ONCE: usize = 16;
+
 /// An attachment to a run.
 pub struct Session {
     // Ports before the space, so that they are dropped before it.
-    pending: Option<Sample<ipc::Service, [VehicleState], FrameHeader>>,
-    states: Subscriber<ipc::Service, [VehicleState], FrameHeader>,
-    coordination: Subscriber<ipc::Service, [Assignment], FrameHeader>,
+    pending: Option<Pending>,
+    states: Inbox<VehicleState>,
+    coordination: Inbox<Assignment>,
     commands: Publisher<ipc::Service, [VehicleCommand], FrameHeader>,
-    _line: attach::Line,
+    line: attach::Line,
     _space: Space,
     run: Run,
     reply: AttachReply,
+    /// The sending end that has proved to be the world's.
+    world_origin: Option<u128>,
+    /// The first step whose coordination is not in force yet.
     next_step: u64,
+    /// When to ask again for what was missed, while that has not come.
+    ask_again_at: Option<Instant>,
+    is_complete: bool,
+    board: Board,
+    refusals: Refusals,
+}
+
+/// A state to be answered.
+struct Pending {
+    frame: Frame<VehicleState>,
+    /// As it was when it was judged.
+    header: FrameHeader,
     /// Coordinators whose frame of this step is still to come.
     missing: u64,
-    is_complete: bool,
-    /// Coordination in force, by zone.
-    assignments: Vec<Vec<Assignment>>,
-    /// Places of the vehicles to be commanded in the state frame.
-    members: Vec<u32>,
 }
 
 /// A command frame being written in shared memory; vehicles and zones are filled in.
@@ -75,8 +88,8 @@ impl Session {
     pub fn attach(options: &Options) -> Result<Session, Error> {
         let (space, line, reply, run) = attach::join(options)?;
         let node = space.node();
-        let states = subscriber(node, frames::SERVICE_STATE)?;
-        let coordination = subscriber(node, frames::SERVICE_COORDINATION)?;
+        let states = Inbox::open(node, frames::SERVICE_STATE)?;
+        let coordination = Inbox::open(node, frames::SERVICE_COORDINATION)?;
         let commands = node
             .service_builder(&name(frames::SERVICE_COMMAND)?)
             .publish_subscribe::<[VehicleCommand]>()
@@ -87,24 +100,28 @@ impl Session {
             .max_loaned_samples(1)
             .initial_max_slice_len(64)
             .allocation_strategy(AllocationStrategy::PowerOfTwo)
-            .set_backpressure_handler(|_| BackpressureAction::DiscardDataAndFail)
+            // A world that has gone on may have no room for late answers, and does not want them.
+            .set_backpressure_handler(|_| BackpressureAction::DiscardData)
             .create()
             .map_err(|e| failed("create a publisher of commands", &e))?;
-        line.ready(reply.index)?;
+        let (next_step, in_force) = line.ready(reply.index)?;
+        let mut board = Board::new(run.spec.zones);
+        board.restore(&in_force);
         Ok(Session {
             pending: None,
             states,
             coordination,
             commands,
-            _line: line,
+            line,
             _space: space,
-            next_step: reply.first_step,
-            missing: 0,
+            next_step,
+            ask_again_at: None,
             is_complete: false,
-            assignments: vec![Vec::new(); run.spec.zones as usize],
-            members: Vec::new(),
+            board,
+            refusals: Refusals::default(),
             run,
             reply,
+            world_origin: None,
         })
     }
 
@@ -145,48 +162,158 @@ impl Session {
         }
     }
 
+    /// Does what can be done now.
     fn poll(&mut self) -> Result<Option<Wake>, Error> {
-        if self.pending.is_none() {
-            let received = self.states.receive().map_err(|e| failed("receive a state frame", &e))?;
-            let Some(sample) = received else { return Ok(None) };
-            self.check(sample.user_header(), Role::World, sample.payload().len())?;
-            if sample.user_header().flags & FLAG_END_OF_RUN != 0 {
-                return Ok(Some(Wake::End));
-            }
-            self.missing = sample.user_header().coordinators_acting;
-            self.members.clear();
-            let run = &self.run;
-            let own = (0..).zip(sample.payload()).filter(|(_, s)| is_member(s) && run.drives(s.zone, s.path));
-            self.members.extend(own.map(|(at, _)| at));
-            self.pending = Some(sample);
+        if self.ask_again_at.is_some() {
+            self.take_reply()?;
         }
-        while self.missing != 0 {
-            let received = self.coordination.receive().map_err(|e| failed("receive coordination", &e))?;
-            let Some(sample) = received else { return Ok(None) };
-            self.check(sample.user_header(), Role::Coordinator, sample.payload().len())?;
-            for group in sample.payload().chunk_by(|a, b| a.zone == b.zone) {
-                if let Some(list) = self.assignments.get_mut(group[0].zone as usize) {
-                    list.clear();
-                    list.extend_from_slice(group);
-                }
-            }
-            self.missing &= !1_u64.checked_shl(sample.user_header().sender_index.into()).unwrap_or(0);
+        if self.take_states()? {
+            return Ok(Some(Wake::End));
         }
+        let Some(step) = self.pending.as_ref().map(|state| state.header.step) else { return Ok(None) };
+        if step > self.next_step {
+            // Steps have passed without this controller, and with them perhaps coordination.
+            self.catch_up()?;
+            return Ok(None);
+        }
+        if step == self.next_step {
+            self.take_coordination()?;
+        }
+        let Some(state) = self.pending.as_ref() else { return Ok(None) };
+        if step == self.next_step && state.missing != 0 {
+            return Ok(None);
+        }
+        // Otherwise its coordination is in force already.
+        self.next_step = self.next_step.max(step.saturating_add(1));
+        self.board.muster(&self.run, state.frame.payload());
         self.is_complete = true;
         Ok(Some(Wake::Step))
     }
 
-    fn check(&self, header: &FrameHeader, role: Role, records: usize) -> Result<(), Error> {
-        let index = if role == Role::World { 0 } else { header.sender_index };
-        let step = self.next_step;
-        ExpectedHeader { run_id: self.reply.run_id, role, index, generation: header.generation, step }
-            .check(header, records)
-            .map_err(|fault| Error::Frame { step, fault })
+    /// Takes the newest state; an older one would be answered too late. Returns whether the run is over.
+    fn take_states(&mut self) -> Result<bool, Error> {
+        for _ in 0..AT_ONCE {
+            let Some(frame) = self.states.receive()? else { break };
+            // What is judged here is what is used: whoever wrote it could change it still.
+            let header = *frame.user_header();
+            let origin = frame.origin().value();
+            if let Err(refusal) = self.judge_state(&header, origin, frame.payload().len()) {
+                let states = &self.states;
+                self.refusals.enter(&header, origin, refusal, || states.process_of(origin));
+                continue;
+            }
+            if header.flags & FLAG_END_OF_RUN != 0 {
+                return Ok(true);
+            }
+            let newest = self.pending.as_ref().map_or(0, |state| state.header.step);
+            // Of the step before the next one, the coordination is known: it may still be answered.
+            if header.step >= newest && header.step.saturating_add(1) >= self.next_step {
+                self.pending = Some(Pending { frame, header, missing: header.coordinators_acting });
+            }
+        }
+        let is_of_the_past = |state: &Pending| state.header.step.saturating_add(1) < self.next_step;
+        if self.pending.as_ref().is_some_and(is_of_the_past) {
+            self.pending = None;
+        }
+        Ok(false)
+    }
+
+    fn judge_state(&mut self, header: &FrameHeader, origin: u128, records: usize) -> Result<(), Refusal> {
+        let AttachReply { run_id, world_process_id: expected, .. } = self.reply;
+        ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
+            .check(header, records)?;
+        if self.world_origin != Some(origin) {
+            if self.states.process_of(origin).is_some_and(|process| process != expected) {
+                return Err(Refusal::Stranger { expected });
+            }
+            self.world_origin = Some(origin);
+        }
+        Ok(())
+    }
+
+    /// Takes coordination of the step at hand, as far as it has come.
+    fn take_coordination(&mut self) -> Result<(), Error> {
+        for _ in 0..AT_ONCE {
+            if self.pending.as_ref().is_none_or(|state| state.missing == 0) {
+                break;
+            }
+            let Some(frame) = self.coordination.receive()? else { break };
+            let header = *frame.user_header();
+            // Copied before it is judged.
+            let assignments = frame.payload().to_vec();
+            let origin = frame.origin().value();
+            drop(frame);
+            match self.judge_coordination(&header, origin, &assignments) {
+                Ok(true) => {
+                    self.board.coordinate(&assignments);
+                    if let Some(state) = &mut self.pending {
+                        state.missing &= !(1 << header.sender_index);
+                    }
+                }
+                Ok(false) => {}
+                Err(refusal) => {
+                    let coordination = &self.coordination;
+                    self.refusals.enter(&header, origin, refusal, || coordination.process_of(origin));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether a coordination frame is to be taken, and not merely late or of a step to come.
+    fn judge_coordination(
+        &self,
+        header: &FrameHeader,
+        _origin: u128,
+        assignments: &[Assignment],
+    ) -> Result<bool, Refusal> {
+        let AttachReply { run_id, coordinators, .. } = self.reply;
+        let FrameHeader { sender_index: index, generation, .. } = *header;
+        ExpectedHeader { run_id, role: Role::Coordinator, index, generation, step: header.step }
+            .check(header, assignments.len())?;
+        if u32::from(index) >= coordinators.min(64) {
+            return Err(Refusal::NoSuchCoordinator { coordinators });
+        }
+        if let Some(record) = assignments.iter().position(|a| a.zone >= self.run.spec.zones) {
+            return Err(Refusal::NoSuchZone { record, zone: assignments[record].zone });
+        }
+        let missing = self.pending.as_ref().map_or(0, |state| state.missing);
+        Ok(header.step == self.next_step && missing >> index & 1 == 1)
+    }
+
+    /// Asks for the coordination in force, and again while no answer comes.
+    fn catch_up(&mut self) -> Result<(), Error> {
+        let now = Instant::now();
+        match self.ask_again_at {
+            Some(at) if now < at => return Ok(()),
+            Some(_) => {}
+            // What lies here is older than what the answer will say; it would only be in the way.
+            None => {
+                for _ in 0..AT_ONCE {
+                    if self.coordination.receive()?.is_none() {
+                        break;
+                    }
+                }
+                while self.line.reply()?.is_some() {}
+            }
+        }
+        self.line.catch_up(self.reply.index)?;
+        self.ask_again_at = Some(now + REPEAT);
+        Ok(())
+    }
+
+    fn take_reply(&mut self) -> Result<(), Error> {
+        if let Some((next_step, in_force)) = self.line.caught_up()? {
+            self.ask_again_at = None;
+            self.next_step = next_step;
+            self.board.restore(&in_force);
+        }
+        Ok(())
     }
 
     /// Number of vehicles to be commanded in this step.
     pub fn count(&self) -> usize {
-        self.members.len()
+        self.board.count()
     }
 
     /// The step to be answered.
@@ -194,20 +321,25 @@ impl Session {
     /// # Panics
     /// When [`wait`](Self::wait) has not returned [`Wake::Step`].
     pub fn step(&self) -> Step<'_> {
-        let sample = self.pending.as_ref().expect("a step is there once wait has returned one");
+        let state = self.pending.as_ref().filter(|_| self.is_complete);
+        let state = state.expect("a step is there once wait has returned one");
         Step {
-            header: sample.user_header(),
-            time_s: sample.user_header().time_ns as f64 * 1e-9,
-            states: sample.payload(),
+            header: &state.header,
+            time_s: state.header.time_ns as f64 * 1e-9,
+            states: state.frame.payload(),
             run: &self.run,
-            members: &self.members,
-            assignments: &self.assignments,
+            board: &self.board,
         }
     }
 
     /// The coordination in force in a zone.
     pub fn assignments(&self, zone: u32) -> &[Assignment] {
-        self.assignments.get(zone as usize).map_or(&[], Vec::as_slice)
+        self.board.assignments(zone)
+    }
+
+    /// What was refused so far, by sender.
+    pub fn refused(&self) -> Vec<Refused> {
+        self.refusals.report()
     }
 
     /// Lends a command frame with header, vehicles and zones filled in and accelerations of 0.
@@ -221,22 +353,20 @@ impl Session {
         let Some(state) = self.pending.as_ref().filter(|_| self.is_complete) else {
             return Err(Error::OutOfTurn("there is no step to answer; wait for one first"));
         };
-        let states = state.payload();
-        let members = &self.members;
+        let (states, board) = (state.frame.payload(), &self.board);
         let mut sample = self
             .commands
             .loan_slice_uninit(count)
             .map_err(|e| failed("lend a command frame; send the one lent before first", &e))?
             .write_from_fn(|i| {
-                let Some(&at) = members.get(i) else { return VehicleCommand::default() };
-                let VehicleState { vehicle, zone, .. } = states[at as usize];
+                let Some((vehicle, zone)) = board.named(states, i) else { return VehicleCommand::default() };
                 VehicleCommand { vehicle, zone, mode: frames::MODE_OCBF, ..VehicleCommand::default() }
             });
         *sample.user_header_mut() = FrameHeader {
             run_id: self.reply.run_id,
             schema_hash: frames::schema_hash(),
-            step: self.next_step,
-            time_ns: state.user_header().time_ns,
+            step: state.header.step,
+            time_ns: state.header.time_ns,
             sender_role: frames::ROLE_CONTROLLER,
             sender_index: self.reply.index as u16,
             generation: self.reply.generation,
@@ -246,31 +376,24 @@ impl Session {
         Ok(Commands(sample))
     }
 
-    /// Sends the answer to this step.
+    /// Sends the answer to this step. One that comes too late is dropped: the next step is another chance.
     pub fn send(&mut self, commands: Commands) -> Result<(), Error> {
         let reached = commands.0.send().map_err(|e| failed("send commands", &e))?;
-        if reached == 0 {
+        // Nobody has room for an answer that is too late, and nobody is there once the world has gone.
+        if reached == 0 && !is_alive(self.reply.world_process_id) {
             return Err(Error::WorldGone(self.reply.world_process_id));
         }
         self.pending = None;
         self.is_complete = false;
-        self.next_step += 1;
         Ok(())
     }
 }
 
-fn subscriber<R: Record>(
-    node: &Node<ipc::Service>,
-    service: &str,
-) -> Result<Subscriber<ipc::Service, [R], FrameHeader>, Error> {
-    node.service_builder(&name(service)?)
-        .publish_subscribe::<[R]>()
-        .user_header::<FrameHeader>()
-        .open()
-        .map_err(|e| failed(&format!("open {service}"), &e))?
-        .subscriber_builder()
-        .create()
-        .map_err(|e| failed(&format!("subscribe to {service}"), &e))
+impl Drop for Session {
+    fn drop(&mut self) {
+        // There is no summary in which it could stand.
+        self.refused().iter().for_each(|refused| eprintln!("{refused}"));
+    }
 }
 
 /// Whether a process exists and is not merely waiting to be reaped.

@@ -4,6 +4,7 @@ use ipc_schemas::{
     self as frames, APPROACH_OWN, ASSIGNMENT_FREE_TERMINAL, ApproachSpec, Assignment, FrameHeader, RunSpec,
     STATE_LEFT, VehicleState,
 };
+use std::ops::Range;
 
 /// The run a controller has joined.
 #[derive(Clone, Debug)]
@@ -14,6 +15,10 @@ pub struct Run {
     pub approaches: Vec<Approach>,
     /// Own index among the controller processes.
     pub index: u32,
+    /// Place of each zone's first approach, and behind the last one.
+    first: Vec<u32>,
+    /// Zones of which this controller drives an approach, ascending.
+    own_zones: Vec<u32>,
 }
 
 /// An approach and its name, `ZONE.APPROACH`.
@@ -26,14 +31,168 @@ pub struct Approach {
 }
 
 impl Run {
+    /// A run of these approaches; nothing when they do not come zone by zone and path by path.
+    pub(crate) fn new(spec: RunSpec, approaches: Vec<Approach>, index: u32) -> Option<Run> {
+        let mut first = Vec::new();
+        let mut at = 0;
+        for group in approaches.chunk_by(|a, b| a.spec.zone == b.spec.zone) {
+            let in_order = (0..).zip(group).all(|(path, a)| a.spec.path == path);
+            if !in_order || group[0].spec.zone as usize != first.len() {
+                return None;
+            }
+            first.push(at);
+            at += group.len() as u32;
+        }
+        if first.len() != spec.zones as usize {
+            return None;
+        }
+        first.push(at);
+        let mut own_zones: Vec<u32> = approaches.iter().filter(|a| a.is_own()).map(|a| a.spec.zone).collect();
+        own_zones.dedup();
+        Some(Run { spec, approaches, index, first, own_zones })
+    }
+
     /// The approach of a path of a zone.
     pub fn approach(&self, zone: u32, path: u32) -> Option<&Approach> {
-        self.approaches.iter().find(|a| a.spec.zone == zone && a.spec.path == path)
+        let [from, to] = *self.first.get(zone as usize..)?.first_chunk()?;
+        self.approaches.get(from.checked_add(path).filter(|at| *at < to)? as usize)
     }
 
     /// Whether this controller drives an approach.
     pub fn drives(&self, zone: u32, path: u32) -> bool {
-        self.approach(zone, path).is_some_and(|a| a.spec.flags & APPROACH_OWN != 0)
+        self.approach(zone, path).is_some_and(Approach::is_own)
+    }
+}
+
+impl Approach {
+    fn is_own(&self) -> bool {
+        self.spec.flags & APPROACH_OWN != 0
+    }
+}
+
+/// The coordination in force in one zone.
+#[derive(Debug, Default)]
+struct Zone {
+    assignments: Vec<Assignment>,
+    /// Place of each assignment's partner in the zone's slice of the state frame. The slice keeps its shape
+    /// until the zone's next event, and with that come new assignments.
+    partners: Vec<u32>,
+    is_resolved: bool,
+}
+
+/// One vehicle to be commanded: places in the state frame and in its zone's assignments.
+#[derive(Clone, Debug)]
+struct Member {
+    at: u32,
+    zone: u32,
+    path: u32,
+    /// The zone's slice of the frame.
+    slice: Range<u32>,
+    assignments: Range<u32>,
+}
+
+/// The coordination in force, and who is to be commanded.
+#[derive(Debug)]
+pub(crate) struct Board {
+    zones: Vec<Zone>,
+    members: Vec<Member>,
+    /// Vehicles of a zone and their places, while partners are resolved; kept for its allocation.
+    places: Vec<(u32, u32)>,
+}
+
+impl Board {
+    /// Without coordination, for so many zones.
+    pub(crate) fn new(zones: u32) -> Board {
+        let zones = (0..zones).map(|_| Zone::default()).collect();
+        Board { zones, members: Vec::new(), places: Vec::new() }
+    }
+
+    /// Replaces all coordination.
+    pub(crate) fn restore(&mut self, assignments: &[Assignment]) {
+        self.zones.iter_mut().for_each(|zone| *zone = Zone::default());
+        self.coordinate(assignments);
+    }
+
+    /// Replaces the coordination of the zones that these are for.
+    pub(crate) fn coordinate(&mut self, assignments: &[Assignment]) {
+        for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
+            if let Some(zone) = self.zones.get_mut(group[0].zone as usize) {
+                zone.assignments.clear();
+                zone.assignments.extend_from_slice(group);
+                zone.is_resolved = false;
+            }
+        }
+    }
+
+    /// The coordination in force in a zone.
+    pub(crate) fn assignments(&self, zone: u32) -> &[Assignment] {
+        self.zones.get(zone as usize).map_or(&[], |zone| &zone.assignments)
+    }
+
+    /// Finds in a state frame who is to be commanded, and what binds them.
+    pub(crate) fn muster(&mut self, run: &Run, states: &[VehicleState]) {
+        self.members.clear();
+        for &number in &run.own_zones {
+            let from = states.partition_point(|s| s.zone < number);
+            let count = states[from..].partition_point(|s| s.zone == number);
+            let slice = &states[from..from + count];
+            let zone = &mut self.zones[number as usize];
+            if !zone.is_resolved {
+                zone.resolve(slice, &mut self.places);
+            }
+            // Assignments come in the order of the members.
+            let mut next = 0;
+            for (state, at) in slice.iter().zip(from as u32..) {
+                if state.flags & STATE_LEFT != 0 {
+                    continue;
+                }
+                let VehicleState { vehicle, path, .. } = *state;
+                let of_vehicle = zone.of_vehicle(vehicle, next);
+                next = of_vehicle.end;
+                if run.drives(number, path) {
+                    let slice = from as u32..(from + count) as u32;
+                    let assignments = of_vehicle.start as u32..of_vehicle.end as u32;
+                    self.members.push(Member { at, zone: number, path, slice, assignments });
+                }
+            }
+        }
+    }
+
+    /// Number of vehicles to be commanded.
+    pub(crate) fn count(&self) -> usize {
+        self.members.len()
+    }
+
+    /// Vehicle and zone of one that is to be commanded.
+    pub(crate) fn named(&self, states: &[VehicleState], member: usize) -> Option<(u32, u32)> {
+        let Member { at, zone, .. } = *self.members.get(member)?;
+        Some((states.get(at as usize)?.vehicle, zone))
+    }
+}
+
+impl Zone {
+    fn resolve(&mut self, slice: &[VehicleState], places: &mut Vec<(u32, u32)>) {
+        places.clear();
+        places.extend(slice.iter().zip(0..).map(|(s, at)| (s.vehicle, at)));
+        places.sort_unstable();
+        let place_of = |vehicle: u32| {
+            let found = places.binary_search_by_key(&vehicle, |&(v, _)| v);
+            found.map_or(u32::MAX, |found| places[found].1)
+        };
+        self.partners.clear();
+        self.partners.extend(self.assignments.iter().map(|a| place_of(a.partner)));
+        self.is_resolved = true;
+    }
+
+    /// The assignments of a vehicle, which are likely to begin at `next`.
+    fn of_vehicle(&self, vehicle: u32, next: usize) -> Range<usize> {
+        let is_its = |a: &Assignment| a.vehicle == vehicle;
+        let all = &self.assignments;
+        let from = match all.get(next).is_some_and(is_its) {
+            true => next,
+            false => all.iter().position(is_its).unwrap_or(next),
+        };
+        from..from + all[from..].iter().take_while(|a| is_its(a)).count()
     }
 }
 
@@ -47,8 +206,7 @@ pub struct Step<'a> {
     /// The whole state frame, all zones.
     pub states: &'a [VehicleState],
     pub(crate) run: &'a Run,
-    pub(crate) members: &'a [u32],
-    pub(crate) assignments: &'a [Vec<Assignment>],
+    pub(crate) board: &'a Board,
 }
 
 impl<'a> Step<'a> {
@@ -59,18 +217,16 @@ impl<'a> Step<'a> {
 
     /// The vehicles to be commanded, in the order of the commands.
     pub fn vehicles(&self) -> impl Iterator<Item = Vehicle<'a>> + use<'a> {
-        let (run, states, assignments) = (self.run, self.states, self.assignments);
-        self.members.iter().map(move |&at| {
-            let state = &states[at as usize];
-            let approach = run.approach(state.zone, state.path);
-            let all = &assignments[state.zone as usize];
-            let from = all.iter().position(|a| a.vehicle == state.vehicle).unwrap_or(all.len());
-            let own = all[from..].iter().take_while(|a| a.vehicle == state.vehicle).count();
+        let Step { run, states, board, .. } = *self;
+        board.members.iter().map(move |member| {
+            let zone = &board.zones[member.zone as usize];
+            let bound = member.assignments.start as usize..member.assignments.end as usize;
             Vehicle {
-                state,
-                length_m: approach.map_or(f64::NAN, |a| a.spec.length_m),
-                assignments: &all[from..from + own],
-                states,
+                state: &states[member.at as usize],
+                length_m: run.approach(member.zone, member.path).map_or(f64::NAN, |a| a.spec.length_m),
+                assignments: &zone.assignments[bound.clone()],
+                partners: &zone.partners[bound],
+                slice: &states[member.slice.start as usize..member.slice.end as usize],
             }
         })
     }
@@ -85,7 +241,9 @@ pub struct Vehicle<'a> {
     pub length_m: f64,
     /// Its constraints, as the coordinator sent them.
     pub assignments: &'a [Assignment],
-    states: &'a [VehicleState],
+    /// Where their partners are in the zone's slice of the frame.
+    partners: &'a [u32],
+    slice: &'a [VehicleState],
 }
 
 /// A vehicle that another must respect.
@@ -110,9 +268,9 @@ impl<'a> Vehicle<'a> {
 
     /// The vehicles it must respect.
     pub fn partners(&self) -> impl Iterator<Item = Partner<'a>> + use<'a> {
-        let (states, zone) = (self.states, self.state.zone);
-        self.assignments.iter().filter_map(move |a| {
-            let state = states.iter().find(|s| s.zone == zone && s.vehicle == a.partner)?;
+        let slice = self.slice;
+        self.assignments.iter().zip(self.partners).filter_map(move |(a, place)| {
+            let state = slice.get(*place as usize).filter(|s| s.vehicle == a.partner)?;
             Some(Partner {
                 state,
                 x_m: state.x_m + a.own_conflict_m - a.partner_conflict_m,
@@ -123,7 +281,118 @@ impl<'a> Vehicle<'a> {
     }
 }
 
-/// Whether a record is to be commanded by somebody.
-pub(crate) fn is_member(state: &VehicleState) -> bool {
-    state.zone != frames::NO_ZONE && state.flags & STATE_LEFT == 0
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ipc_schemas::{NO_VEHICLE, NO_ZONE, STATE_ENTERED};
+
+    /// Three zones of two approaches each; the controller drives all of zone 0 and one approach of zone 2.
+    fn run() -> Run {
+        let approach = |zone, path| {
+            let flags = if zone == 0 || (zone, path) == (2, 1) { APPROACH_OWN } else { 0 };
+            let length_m = f64::from(100 + 10 * zone + path);
+            let spec = ApproachSpec { zone, path, flags, length_m, ..ApproachSpec::default() };
+            Approach { spec, name: format!("z{zone}.a{path}") }
+        };
+        let approaches: Vec<_> =
+            (0..3).flat_map(|zone| (0..2).map(move |path| approach(zone, path))).collect();
+        let spec = RunSpec { zones: 3, approaches: 6, ..RunSpec::default() };
+        Run::new(spec, approaches, 1).expect("they come in order")
+    }
+
+    /// In each zone one that left and five members whose ids do not ascend; a vehicle on a link at the end.
+    fn states() -> Vec<VehicleState> {
+        let state = |zone: u32, k: u32| VehicleState {
+            vehicle: (zone * 100 + k * 37) % 101,
+            zone,
+            path: k % 2,
+            x_m: f64::from(50 - k),
+            flags: if k == 0 { STATE_LEFT } else { STATE_ENTERED },
+            ..VehicleState::default()
+        };
+        let zones = (0..3).flat_map(|zone| (0..6).map(move |k| state(zone, k)));
+        zones.chain([VehicleState { vehicle: 7, zone: NO_ZONE, ..VehicleState::default() }]).collect()
+    }
+
+    /// Everybody yields to the two before it.
+    fn assignments(states: &[VehicleState]) -> Vec<Assignment> {
+        let mut all = Vec::new();
+        for zone in states.chunk_by(|a, b| a.zone == b.zone).filter(|zone| zone[0].zone != NO_ZONE) {
+            for (k, s) in zone.iter().enumerate().skip(1) {
+                for (kind, back) in [(frames::CONSTRAINT_REAR_END, 1), (frames::CONSTRAINT_MERGE, 2)] {
+                    let partner = k.checked_sub(back).map_or(NO_VEHICLE, |k| zone[k].vehicle);
+                    let (vehicle, zone) = (s.vehicle, s.zone);
+                    all.push(Assignment {
+                        vehicle,
+                        partner,
+                        zone,
+                        kind,
+                        own_conflict_m: 3.0,
+                        ..Assignment::default()
+                    });
+                }
+            }
+        }
+        all
+    }
+
+    /// What a search through the whole frame finds: vehicle, length, and partners with their positions.
+    fn searched(run: &Run, states: &[VehicleState], all: &[Assignment]) -> Vec<(u32, f64, Vec<(u32, f64)>)> {
+        let own = states.iter().filter(|s| s.flags & STATE_LEFT == 0 && run.drives(s.zone, s.path));
+        own.map(|s| {
+            let its = all.iter().filter(|a| (a.zone, a.vehicle) == (s.zone, s.vehicle));
+            let partners = its.filter_map(|a| {
+                let partner = states.iter().find(|p| (p.zone, p.vehicle) == (s.zone, a.partner))?;
+                Some((partner.vehicle, partner.x_m + 3.0))
+            });
+            let length_m = f64::from(100 + 10 * s.zone + s.path);
+            (s.vehicle, length_m, partners.collect())
+        })
+        .collect()
+    }
+
+    fn seen(run: &Run, states: &[VehicleState], board: &Board) -> Vec<(u32, f64, Vec<(u32, f64)>)> {
+        let header = FrameHeader::default();
+        let step = Step { header: &header, time_s: 0.0, states, run, board };
+        let partners = |v: &Vehicle<'_>| v.partners().map(|p| (p.state.vehicle, p.x_m)).collect();
+        step.vehicles().map(|v| (v.state.vehicle, v.length_m, partners(&v))).collect()
+    }
+
+    #[test]
+    fn vehicles_and_partners_are_those_a_search_through_the_whole_frame_finds() {
+        let (run, mut states) = (run(), states());
+        let all = assignments(&states);
+        let mut board = Board::new(3);
+        board.coordinate(&all);
+        board.muster(&run, &states);
+        let expected = searched(&run, &states, &all);
+        assert_eq!(expected.len(), 5 + 3);
+        assert!(expected.iter().any(|(.., partners)| partners.len() == 2));
+        assert_eq!(seen(&run, &states, &board), expected);
+        // Another step of the same shape, without coordination.
+        states.iter_mut().for_each(|s| s.x_m += 1.5);
+        board.muster(&run, &states);
+        assert_eq!(seen(&run, &states, &board), searched(&run, &states, &all));
+        // A vehicle left zone 0: without the coordination that comes with it, nobody is mistaken for another.
+        states.remove(1);
+        board.muster(&run, &states);
+        for (vehicle, _, partners) in seen(&run, &states, &board) {
+            let its = |a: &&Assignment| a.vehicle == vehicle;
+            assert!(partners.iter().all(|(p, _)| all.iter().filter(its).any(|a| a.partner == *p)));
+        }
+        board.restore(&assignments(&states));
+        board.muster(&run, &states);
+        assert_eq!(seen(&run, &states, &board), searched(&run, &states, &assignments(&states)));
+    }
+
+    #[test]
+    fn approaches_out_of_order_are_no_run() {
+        let good = run();
+        let mut swapped = good.approaches.clone();
+        swapped.swap(0, 1);
+        assert!(Run::new(good.spec, swapped, 0).is_none());
+        assert!(Run::new(RunSpec { zones: 4, ..good.spec }, good.approaches.clone(), 0).is_none());
+        assert!(good.approach(2, 2).is_none() && good.approach(3, 0).is_none());
+        assert!(good.approach(0, u32::MAX).is_none() && good.approach(u32::MAX, 0).is_none());
+    }
 }

@@ -1,16 +1,30 @@
 /*
  * Write a controller for Control Zones in C.
  *
- *     cz_plugin_t *plugin = cz_attach(NULL, NULL, 30.0);
- *     int wake = plugin ? CZ_TIMEOUT : CZ_ERROR;
- *     while (wake != CZ_END && wake != CZ_ERROR) {
- *         wake = cz_wait(plugin, 1.0);
- *         if (wake != CZ_STEP) continue;
- *         size_t count;
- *         const cz_vehicle_t *vehicles = cz_vehicles(plugin, &count);
- *         cz_vehicle_command_t *commands = cz_commands(plugin, &count);
- *         for (size_t i = 0; i < count; i++) commands[i].u_mps2 = 15.0 - vehicles[i].state->v_mps;
- *         if (cz_send(plugin) != 0) wake = CZ_ERROR;
+ *     #include <control_zones/plugin.h>
+ *     #include <stdio.h>
+ *
+ *     int main(void) {
+ *         cz_plugin_t *plugin = cz_attach(NULL, NULL, 30.0);
+ *         int wake = plugin ? CZ_TIMEOUT : CZ_ERROR;
+ *         while (wake != CZ_END && wake != CZ_ERROR) {
+ *             wake = cz_wait(plugin, 1.0);
+ *             if (wake != CZ_STEP) continue;
+ *             const cz_run_spec_t *spec = cz_run_spec(plugin);
+ *             size_t count;
+ *             const cz_vehicle_t *vehicles = cz_vehicles(plugin, &count);
+ *             cz_vehicle_command_t *commands = cz_commands(plugin, &count);
+ *             for (size_t i = 0; i < count; i++) {
+ *                 double u = 15.0 - vehicles[i].state->v_mps;
+ *                 if (u < spec->u_min_mps2) u = spec->u_min_mps2;
+ *                 if (u > spec->u_max_mps2) u = spec->u_max_mps2;
+ *                 commands[i].u_mps2 = u;
+ *             }
+ *             if (cz_send(plugin) != 0) wake = CZ_ERROR;
+ *         }
+ *         if (wake == CZ_ERROR) fprintf(stderr, "%s\n", cz_last_error());
+ *         cz_detach(plugin);
+ *         return wake == CZ_END ? 0 : 1;
  *     }
  *
  * A handle is used by one thread at a time. Pointers into frames are valid until cz_send: the frames lie in
@@ -78,7 +92,8 @@ const cz_vehicle_t *cz_vehicles(const cz_plugin_t *plugin, size_t *count);
 const cz_assignment_t *cz_assignments(const cz_plugin_t *plugin, uint32_t zone, size_t *count);
 /** Lends the command frame, vehicles and zones filled in, accelerations 0; valid until cz_send. */
 cz_vehicle_command_t *cz_commands(cz_plugin_t *plugin, size_t *count);
-/** Sends the command frame: 0, or CZ_ERROR. */
+/** Sends the command frame: 0, or CZ_ERROR. One that comes too late for its step is dropped, which is no error:
+ *  the next step is another chance. */
 int cz_send(cz_plugin_t *plugin);
 
 #ifdef __cplusplus

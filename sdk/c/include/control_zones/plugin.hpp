@@ -1,8 +1,20 @@
 // Write a controller for Control Zones in C++17: a RAII session, and a loop around a function.
 //
-//     control_zones::run([](const control_zones::Session&, const cz_vehicle_t& vehicle) {
-//         return 15.0 - vehicle.state->v_mps;
-//     });
+//     #include <algorithm>
+//     #include <control_zones/plugin.hpp>
+//     #include <iostream>
+//
+//     int main() {
+//         try {
+//             control_zones::run([](const control_zones::Session &session, const cz_vehicle_t &vehicle) {
+//                 const auto &spec = session.spec();
+//                 return std::clamp(15.0 - vehicle.state->v_mps, spec.u_min_mps2, spec.u_max_mps2);
+//             });
+//         } catch (const std::exception &error) {
+//             std::cerr << error.what() << '\n';
+//             return 1;
+//         }
+//     }
 #ifndef CONTROL_ZONES_PLUGIN_HPP
 #define CONTROL_ZONES_PLUGIN_HPP
 
