@@ -98,3 +98,18 @@ fn controllers_that_hang_or_end_badly_are_diagnosed() {
         assert!(breach["what"].as_str().unwrap().contains(words), "{mode}: {report:#}");
     }
 }
+
+/// The world put in commands from the frame it held, and panicked over what had become of it.
+#[test]
+fn a_frame_rewritten_after_it_was_sent_does_not_end_the_world() {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cz"));
+    let controller = format!("merge-1={} turncoat", broken().display());
+    command.args(["run", "--on-miss", "hold", "--deadline", "0.3", "--controller", &controller]);
+    let output = command.output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    // What ends the run is the controller's own end.
+    assert!(said.contains("ended with code 9"), "{said}");
+    for panic in ["panicked", "internal error", "world (process"] {
+        assert!(!said.contains(panic), "{said}");
+    }
+}

@@ -79,8 +79,32 @@ impl From<ReproduceError> for AppError {
     }
 }
 
+/// Has a panic end in one line, the last that is said: a supervisor shows a part's last words.
+fn say_panics_in_a_line(program: &'static str) {
+    std::panic::set_hook(Box::new(move |panic| {
+        use std::io::Write;
+        let mut err = std::io::stderr().lock();
+        // Where it is asked for (RUST_BACKTRACE). Nobody is left to hear that stderr is full.
+        let backtrace = std::backtrace::Backtrace::capture();
+        if backtrace.status() == std::backtrace::BacktraceStatus::Captured {
+            let _ = write!(err, "{backtrace}");
+        }
+        let payload = panic.payload();
+        let what = payload.downcast_ref::<&str>().copied();
+        let what =
+            what.or_else(|| payload.downcast_ref::<String>().map(String::as_str)).unwrap_or("no message");
+        let at = panic.location().map(ToString::to_string).unwrap_or_default();
+        let _ = writeln!(err, "{}", panic_line(program, what, &at));
+    }));
+}
+
+fn panic_line(program: &str, what: &str, at: &str) -> String {
+    format!("{program}: internal error, please report it: {} (at {at})", printable(what))
+}
+
 /// `cz`.
 pub fn cz() -> ExitCode {
+    say_panics_in_a_line("cz");
     let args = args::Cz::parse();
     finish(
         "cz",
@@ -106,16 +130,19 @@ pub fn cz() -> ExitCode {
 
 /// `cz-world`, the same as `cz world`.
 pub fn cz_world() -> ExitCode {
+    say_panics_in_a_line("cz-world");
     finish("cz-world", parts::world(&args::Standalone::<args::WorldArgs>::parse().args))
 }
 
 /// `cz-coord`, the same as `cz coord`.
 pub fn cz_coord() -> ExitCode {
+    say_panics_in_a_line("cz-coord");
     finish("cz-coord", parts::coordinator(&args::Standalone::<args::PartArgs>::parse().args))
 }
 
 /// `cz-ctrl`, the same as `cz ctrl`.
 pub fn cz_ctrl() -> ExitCode {
+    say_panics_in_a_line("cz-ctrl");
     finish("cz-ctrl", parts::controller(&args::Standalone::<args::PartArgs>::parse().args))
 }
 
@@ -138,6 +165,15 @@ impl AppError {
             AppError::Failed(_) => text.split("\n  ").map(printable).collect::<Vec<_>>().join("\n  "),
             _ => printable(&text),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn a_panic_is_said_in_one_line() {
+        let line = super::panic_line("cz", "a \"b\"\nc", "src/x.rs:1:2");
+        assert_eq!(line, "cz: internal error, please report it: a \"b\"\\nc (at src/x.rs:1:2)");
     }
 }
 

@@ -30,9 +30,6 @@ type CoordinatorSide = CoordinatorDriver<
 type ControllerSide =
     ControllerDriver<MemoryInbox<VehicleState>, MemoryInbox<Assignment>, MemoryOutbox<VehicleCommand>>;
 
-/// What is kept of a run in one thread.
-pub type MemoryLedger = Ledger<MemoryFrame<VehicleCommand>>;
-
 /// World, coordinators and controllers of a run, in one thread.
 #[derive(Debug)]
 pub struct InProcess {
@@ -63,7 +60,7 @@ impl InProcess {
     }
 
     /// A run that goes on with the world as it stands, from what the ledger has of the steps before.
-    pub fn going_on(world: World, ledger: &MemoryLedger, coordinators: u32, controllers: u32) -> InProcess {
+    pub fn going_on(world: World, ledger: &Ledger, coordinators: u32, controllers: u32) -> InProcess {
         let step = world.step();
         let mut run = InProcess::build(world, coordinators, controllers, false);
         for (index, coordinator) in run.coordinators.iter_mut().enumerate() {

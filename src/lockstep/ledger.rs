@@ -10,7 +10,6 @@
 use crate::coordination::{Audience, is_event};
 use crate::scenario::Scenario;
 use crate::step::Step;
-use crate::transport::Frame;
 use ipc_schemas::{Assignment, FrameHeader, Role, VehicleCommand, VehicleState, ZoneSummary};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -55,30 +54,9 @@ impl Handover {
     }
 }
 
-/// One controller's commands of one step.
-#[derive(Debug)]
-enum Commands<F> {
-    /// None yet.
-    Missing,
-    /// As they came.
-    Frame(F),
-    /// Put in by the world.
-    Own(Vec<VehicleCommand>),
-}
-
-impl<F: Frame<VehicleCommand>> Commands<F> {
-    fn records(&self) -> &[VehicleCommand] {
-        match self {
-            Commands::Missing => &[],
-            Commands::Frame(frame) => frame.records(),
-            Commands::Own(records) => records,
-        }
-    }
-}
-
 /// The frames of the present step, and what was in force before it.
 #[derive(Debug)]
-pub struct Ledger<F> {
+pub struct Ledger {
     audiences: Vec<Audience>,
     in_force: Vec<Vec<Assignment>>,
     /// Per zone, the last summary of its downstream neighbour it acted on.
@@ -89,18 +67,19 @@ pub struct Ledger<F> {
     coordination: Vec<(u16, Vec<Assignment>)>,
     /// Buffers of `coordination` to be used again.
     spare: Vec<Vec<Assignment>>,
-    before: Vec<Commands<F>>,
-    now: Vec<Commands<F>>,
+    /// Each controller's commands of the step before, and of this one; empty before they have come.
+    before: Vec<Vec<VehicleCommand>>,
+    now: Vec<Vec<VehicleCommand>>,
     /// Whether the present step has begun.
     has_begun: bool,
 }
 
-impl<F: Frame<VehicleCommand>> Ledger<F> {
+impl Ledger {
     /// The ledger of a run that has not begun.
-    pub fn new(scenario: &Scenario, controllers: u32) -> Ledger<F> {
+    pub fn new(scenario: &Scenario, controllers: u32) -> Ledger {
         let network = &scenario.network;
         let zones = network.zones.len();
-        let none = || (0..controllers).map(|_| Commands::Missing).collect();
+        let none = || vec![Vec::new(); controllers as usize];
         Ledger {
             audiences: (0..zones as u32).map(|zone| Audience::of(network, zone)).collect(),
             in_force: vec![Vec::new(); zones],
@@ -145,14 +124,10 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
         self.coordination.insert(at, (coordinator, copy));
     }
 
-    /// A controller's frame of this step.
-    pub fn command(&mut self, controller: usize, frame: F) {
-        self.now[controller] = Commands::Frame(frame);
-    }
-
-    /// Commands the world has put in for a controller in this step.
-    pub fn substitute(&mut self, controller: usize, commands: Vec<VehicleCommand>) {
-        self.now[controller] = Commands::Own(commands);
+    /// A controller's commands of this step, as they have been judged or put in; the vector comes back with
+    /// others to be written over.
+    pub fn command(&mut self, controller: usize, commands: &mut Vec<VehicleCommand>) {
+        std::mem::swap(&mut self.now[controller], commands);
     }
 
     /// The step is over: what was sent in it is in force.
@@ -167,7 +142,8 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
         }
         self.spare.extend(self.coordination.drain(..).map(|(_, assignments)| assignments));
         for (before, now) in self.before.iter_mut().zip(&mut self.now) {
-            *before = std::mem::replace(now, Commands::Missing);
+            std::mem::swap(before, now);
+            now.clear();
         }
     }
 
@@ -178,7 +154,7 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
         self.coordinate(0, &step.coordination);
         let controllers = self.now.len();
         for (index, part) in step.commands.iter().take(controllers).enumerate() {
-            self.substitute(index, part.records.clone());
+            self.now[index].clone_from(&part.records);
         }
         self.end();
     }
@@ -191,15 +167,14 @@ impl<F: Frame<VehicleCommand>> Ledger<F> {
         }
     }
 
-    /// A controller's commands of the present step, and whether the world put them in.
-    pub fn commands(&self, controller: usize) -> (&[VehicleCommand], bool) {
-        let commands = &self.now[controller];
-        (commands.records(), matches!(commands, Commands::Own(_)))
+    /// A controller's commands of the present step.
+    pub fn commands(&self, controller: usize) -> &[VehicleCommand] {
+        &self.now[controller]
     }
 
     /// A controller's commands of the step before.
     pub fn commands_before(&self, controller: usize) -> &[VehicleCommand] {
-        self.before[controller].records()
+        &self.before[controller]
     }
 
     /// The coordination of the present step so far, by coordinator process.

@@ -59,7 +59,10 @@ where
     identity: Identity,
     controllers: Vec<Seat>,
     coordinators: Vec<Seat>,
-    ledger: Option<Ledger<M::Frame>>,
+    ledger: Option<Ledger>,
+    /// A command frame being judged, copied out of its sender's reach first; so too the coordination.
+    judged: Vec<VehicleCommand>,
+    judged_coordination: Vec<Assignment>,
     refusals: Refusals,
     /// Refused frames, held for a while so that their senders are passed over in favour of others.
     detained: (Vec<M::Frame>, Vec<A::Frame>),
@@ -116,6 +119,8 @@ where
             ports,
             identity: Identity { run_id, role: Role::World, index: 0, generation: 0 },
             ledger,
+            judged: Vec::new(),
+            judged_coordination: Vec::new(),
             refusals: Refusals::default(),
             detained: (Vec::new(), Vec::new()),
             suspect: None,
@@ -134,7 +139,7 @@ where
     }
 
     /// Keeps a ledger that has been begun already, in place of its own.
-    pub fn keep(&mut self, ledger: Option<Ledger<M::Frame>>) {
+    pub fn keep(&mut self, ledger: Option<Ledger>) {
         self.ledger = ledger;
     }
 
@@ -183,11 +188,11 @@ where
             return Ok(false);
         }
         for index in (0..self.controllers.len()).filter(|i| missing.commands >> i & 1 == 1) {
-            let commands = self.world.substitute(index as u32, ledger.commands_before(index), verdict);
+            let mut commands = self.world.substitute(index as u32, ledger.commands_before(index), verdict);
             self.world.put_in(index as u32, &commands).expect(
                 "what the world puts in has each of the controller's vehicles once, within its limits",
             );
-            ledger.substitute(index, commands);
+            ledger.command(index, &mut commands);
         }
         self.put_in = missing.commands;
         self.put_in_verdict = verdict;
@@ -348,10 +353,7 @@ where
         let commands: Vec<CommandPart<'_>> = self.controllers[..controllers]
             .iter()
             .enumerate()
-            .map(|(index, seat)| CommandPart {
-                generation: seat.generation,
-                records: ledger.commands(index).0,
-            })
+            .map(|(index, seat)| CommandPart { generation: seat.generation, records: ledger.commands(index) })
             .collect();
         observer.observe(&StepFrames {
             header: self.header,
@@ -383,17 +385,18 @@ where
     fn take_command(&mut self, missing: &mut Missing) -> Result<bool, LockstepError> {
         for _ in 0..REFUSED_AT_ONCE {
             let Some(frame) = self.ports.command.receive()? else { break };
-            match self.judge_command(&frame, missing.commands) {
-                Ok(index) => {
-                    missing.commands &= !(1 << index);
+            let header = *frame.header();
+            match self.judge_command(&header, &frame, missing.commands) {
+                Ok(()) => {
+                    missing.commands &= !(1 << header.sender_index);
                     if let Some(ledger) = &mut self.ledger {
-                        ledger.command(usize::from(index), frame);
+                        ledger.command(usize::from(header.sender_index), &mut self.judged);
                     }
                     return Ok(true);
                 }
                 Err(None) => self.refusals.late += 1,
                 Err(Some(refusal)) => {
-                    self.refuse(Role::Controller, frame.header(), frame.origin(), refusal);
+                    self.refuse(Role::Controller, &header, frame.origin(), refusal);
                     self.detained.0.push(frame);
                 }
             }
@@ -402,20 +405,27 @@ where
         Ok(false)
     }
 
-    /// Who sent a frame that has been taken; otherwise why it is not, or nothing for one that is merely late.
-    fn judge_command(&mut self, frame: &M::Frame, missing: u64) -> Result<u16, Option<Refusal>> {
-        let header = frame.header();
+    /// Judges a frame, of which the header has been copied already, and leaves its records in `judged`: they
+    /// stay in the memory of their sender, who may change them at any time. Otherwise why it is not taken, or
+    /// nothing for one that is merely late.
+    fn judge_command(
+        &mut self,
+        header: &FrameHeader,
+        frame: &M::Frame,
+        missing: u64,
+    ) -> Result<(), Option<Refusal>> {
         let step = self.world.step();
         let index = header.sender_index;
         let seat = self.controllers.get_mut(usize::from(index));
         let generation = seat.as_ref().map_or(0, |seat| seat.generation);
         let expected =
             ExpectedHeader { run_id: self.identity.run_id, role: Role::Controller, index, generation, step };
-        check_sender(&expected, frame, frame.records().len(), seat, missing, &self.ports.command)?;
-        match self.world.command(u32::from(index), frame.records()) {
-            Ok(()) => Ok(index),
-            Err(fault) => Err(Some(Refusal::Command { step, fault })),
-        }
+        let records = frame.records();
+        let sent = (header, records.len(), frame.origin());
+        check_sender(&expected, sent, seat, missing, &self.ports.command)?;
+        copy_out(&mut self.judged, records);
+        let taken = self.world.command(u32::from(index), &self.judged);
+        taken.map_err(|fault| Some(Refusal::Command { step, fault }))
     }
 
     /// Takes a coordination frame; returns whether one was taken.
@@ -426,17 +436,18 @@ where
                 None => None,
             };
             let Some(frame) = received else { break };
-            match self.judge_coordination(&frame, missing.coordination) {
-                Ok(index) => {
-                    missing.coordination &= !(1 << index);
+            let header = *frame.header();
+            match self.judge_coordination(&header, &frame, missing.coordination) {
+                Ok(()) => {
+                    missing.coordination &= !(1 << header.sender_index);
                     if let Some(ledger) = &mut self.ledger {
-                        ledger.coordinate(index, frame.records());
+                        ledger.coordinate(header.sender_index, &self.judged_coordination);
                     }
                     return Ok(true);
                 }
                 Err(None) => self.refusals.late += 1,
                 Err(Some(refusal)) => {
-                    self.refuse(Role::Coordinator, frame.header(), frame.origin(), refusal);
+                    self.refuse(Role::Coordinator, &header, frame.origin(), refusal);
                     self.detained.1.push(frame);
                 }
             }
@@ -445,8 +456,13 @@ where
         Ok(false)
     }
 
-    fn judge_coordination(&mut self, frame: &A::Frame, missing: u64) -> Result<u16, Option<Refusal>> {
-        let header = frame.header();
+    /// The same for coordination.
+    fn judge_coordination(
+        &mut self,
+        header: &FrameHeader,
+        frame: &A::Frame,
+        missing: u64,
+    ) -> Result<(), Option<Refusal>> {
         let step = self.world.step();
         let index = header.sender_index;
         let count = self.coordinators.len() as u32;
@@ -455,12 +471,14 @@ where
         let expected =
             ExpectedHeader { run_id: self.identity.run_id, role: Role::Coordinator, index, generation, step };
         let inbox = self.ports.coordination.as_ref().expect("the frame came from this inbox");
-        check_sender(&expected, frame, frame.records().len(), seat, missing, inbox)?;
+        let records = frame.records();
+        check_sender(&expected, (header, records.len(), frame.origin()), seat, missing, inbox)?;
+        copy_out(&mut self.judged_coordination, records);
         let own = zones_of(self.world.scenario().network.zones.len() as u32, u32::from(index), count);
-        match frame.records().iter().position(|a| !own.contains(&a.zone)) {
-            None => Ok(index),
+        match self.judged_coordination.iter().position(|a| !own.contains(&a.zone)) {
+            None => Ok(()),
             Some(record) => {
-                let zone = frame.records()[record].zone;
+                let zone = self.judged_coordination[record].zone;
                 Err(Some(Refusal::ForeignZone { step, record, zone }))
             }
         }
@@ -491,17 +509,25 @@ impl Sheet for Slots<'_, VehicleState> {
     }
 }
 
+/// Copies records out of a frame, reading each once. The copy grows by powers of two, so that it stops growing
+/// early on.
+fn copy_out<R: Copy>(copy: &mut Vec<R>, records: &[R]) {
+    copy.clear();
+    if copy.capacity() < records.len() {
+        copy.reserve(records.len().next_power_of_two());
+    }
+    copy.extend_from_slice(records);
+}
+
 /// Checks the header of an answer, that its sender has the place it claims, and that it is still asked for.
 /// An answer that is merely late or comes twice is an error without a refusal.
-fn check_sender<R: ipc_schemas::Record, F: Frame<R>, I: Inbox<R>>(
+fn check_sender<R: ipc_schemas::Record, I: Inbox<R>>(
     expected: &ExpectedHeader,
-    frame: &F,
-    records: usize,
+    (header, records, origin): (&FrameHeader, usize, u128),
     seat: Option<&mut Seat>,
     missing: u64,
     inbox: &I,
 ) -> Result<(), Option<Refusal>> {
-    let header = frame.header();
     let checked = expected.check(header, records);
     let late = match &checked {
         Ok(()) => header.sender_index < 64 && missing >> header.sender_index & 1 == 0,
@@ -513,7 +539,6 @@ fn check_sender<R: ipc_schemas::Record, F: Frame<R>, I: Inbox<R>>(
         return Err(Some(fault.into()));
     }
     let Some(seat) = seat else { return Err(Some(Refusal::Unexpected { step: header.step })) };
-    let origin = frame.origin();
     if let Some(process_id) = seat.process_id.filter(|_| seat.origin != Some(origin)) {
         match inbox.process_of(origin) {
             Some(found) if found != process_id => {

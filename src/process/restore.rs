@@ -1,6 +1,7 @@
 //! A recorded run that goes on in one thread.
 
-use crate::lockstep::in_process::{InProcess, MemoryLedger};
+use crate::lockstep::Ledger;
+use crate::lockstep::in_process::InProcess;
 use crate::record::{Metadata, Reader, ReplayError, Source, replay_world};
 use crate::scenario::Scenario;
 use crate::world::ChangeError;
@@ -31,7 +32,7 @@ pub fn restore<S: Source>(
     if let Some(scenario) = scenario {
         world.change(scenario)?;
     }
-    let mut ledger = MemoryLedger::new(world.scenario(), controllers);
+    let mut ledger = Ledger::new(world.scenario(), controllers);
     // Behind these the file may be cut off.
     for recorded in reader.steps().take(step as usize) {
         ledger.relive(&recorded.map_err(ReplayError::from)?);
