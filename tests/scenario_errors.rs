@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
-use control_zones::scenario::{Override, Scenario, ScenarioError, load, load_embedded, load_file};
+use control_zones::scenario::{Demand, Override, Scenario, ScenarioError, load, load_embedded, load_file};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -743,13 +743,46 @@ fn missing_scenarios_and_seeds() {
         let message = error(load(Some(path), &[], None));
         assert!(message.starts_with(&format!("{path}: cannot read the scenario file: ")), "{message}");
     }
-    let message = error(load(None, &[], Some(7)));
-    assert!(message.starts_with("<embedded>/two-merges.toml:"), "{message}");
-    assert!(message.contains("roads.main1.demand.trace = \"data/arrivals_400_seed{seed}.csv\""), "{message}");
-    assert!(message.contains("expected an arrival trace for seed 7"), "{message}");
+    let set = "roads.main1.demand.trace=arrivals-{seed}.csv".parse().unwrap();
+    let message = error(load(None, &[set], Some(7)));
+    assert!(message.contains("roads.main1.demand.trace = \"arrivals-{seed}.csv\""), "{message}");
+    assert!(
+        message.contains("expected an arrival trace for seed 7: a file, or one of the embedded sumo-400-1, "),
+        "{message}"
+    );
     let dir = tempfile::tempdir().unwrap();
     fs::write(dir.path().join("s.toml"), b"\xff").unwrap();
     assert!(error(load_file(&dir.path().join("s.toml"), &[], None)).contains("cannot read"));
+}
+
+/// The default scenario used to refuse every seed above 3: it has three traces.
+#[test]
+fn every_seed_runs_and_those_with_a_trace_have_it() {
+    let demand = |name: &str, seed: u64, sets: &[&str]| {
+        let sets: Vec<_> = sets.iter().map(|s| s.parse().unwrap()).collect();
+        load(Some(name), &sets, Some(seed)).unwrap().network.roads.remove(0).demand
+    };
+    for name in ["two-merges", "faulty-sensors"] {
+        for seed in 1..=3 {
+            let path = format!("roads.main1.demand={{trace=\"data/arrivals_400_seed{seed}.csv\"}}");
+            let demand = (demand(name, seed, &[]), demand(name, 9, &[&path]));
+            assert!(matches!(&demand.0, Demand::Trace(arrivals) if arrivals.len() > 30));
+            assert_eq!(demand.0, demand.1);
+        }
+        for seed in [0, 4, 77, u64::MAX] {
+            assert!(matches!(demand(name, seed, &[]), Demand::Poisson(_)), "{name} {seed}");
+        }
+    }
+    // A trace by name whatever the seed, and random arrivals where a trace would have been.
+    let named = demand("two-merges", 77, &["roads.main1.demand.trace=sumo-400-2"]);
+    assert_eq!(named, demand("two-merges", 2, &[]));
+    let random = demand("two-merges", 1, &["roads.main1.demand.speed_mean_mps=15"]);
+    assert!(matches!(random, Demand::Poisson(p) if p.speed.mean_mps == 15.0));
+    let error = |set: &str| load(None, &[set.parse().unwrap()], None).unwrap_err().to_string();
+    let message = error("roads.main1.demand.trace_seeds=[1,-2]");
+    assert!(message.contains("trace_seeds.1 = -2: expected a list of seeds, integers from 0"), "{message}");
+    let message = error("roads.main1.demand={trace=\"sumo-400-1\",trace_seeds=[1]}");
+    assert!(message.contains("roads.main1.demand.rates: missing; expected trace and rates"), "{message}");
 }
 
 #[test]

@@ -28,7 +28,22 @@ pub(super) fn trace(path: &str) -> Option<&'static str> {
     TRACES.iter().find(|(p, _)| *p == path).map(|(_, text)| *text)
 }
 
-/// Paths of all embedded traces.
+/// Name and path of the embedded traces; by name every scenario may use them, wherever its file is.
+const NAMES: [(&str, &str); 6] = [
+    ("sumo-400-1", "data/arrivals_400_seed1.csv"),
+    ("sumo-400-2", "data/arrivals_400_seed2.csv"),
+    ("sumo-400-3", "data/arrivals_400_seed3.csv"),
+    ("sumo-varying-1", "data/arrivals_varying_seed1.csv"),
+    ("sumo-varying-2", "data/arrivals_varying_seed2.csv"),
+    ("sumo-varying-3", "data/arrivals_varying_seed3.csv"),
+];
+
+/// Text of an embedded trace, by its name.
+pub(super) fn named_trace(name: &str) -> Option<&'static str> {
+    NAMES.iter().find(|(n, _)| *n == name).and_then(|(_, path)| trace(path))
+}
+
+/// Names of all embedded traces.
 pub(super) fn trace_names() -> impl Iterator<Item = &'static str> {
-    TRACES.iter().map(|(path, _)| *path)
+    NAMES.iter().map(|(name, _)| *name)
 }

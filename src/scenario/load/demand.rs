@@ -37,10 +37,26 @@ impl DemandReader<'_> {
     pub(super) fn read(&mut self, road: u32, table: &Table<'_>) -> Result<Demand, ScenarioError> {
         const EXPECTED: &str =
             "a table with trace = \"FILE.csv\", or with rates and the other keys of random arrivals";
+        const OTHER_SEEDS: &str = "trace and rates, where trace_seeds lists the seeds that have a trace";
         const POISSON: [&str; 6] =
             ["rates", "min_headway_s", "speed_mean_mps", "speed_sd_mps", "speed_min_mps", "speed_max_mps"];
         let mut t = table.need("demand", EXPECTED)?.table(EXPECTED)?;
-        t.only(&[&["trace"][..], &POISSON].concat())?;
+        t.only(&[&["trace", "trace_seeds"][..], &POISSON].concat())?;
+        if let Some(seeds) = t.get("trace_seeds") {
+            let (trace, rates) = (t.need("trace", OTHER_SEEDS)?, t.need("rates", OTHER_SEEDS)?);
+            let random_is_set = POISSON.iter().any(|key| t.get(key).is_some_and(|field| field.is_set()));
+            // Whoever sets one of the two by hand means that one, whatever the seed.
+            let takes_trace = match (trace.is_set(), random_is_set) {
+                (true, false) if !seeds.is_set() => true,
+                (false, true) if !seeds.is_set() => false,
+                _ => lists(&seeds, self.seed)?,
+            };
+            if takes_trace {
+                return self.trace(road, &trace);
+            }
+            t.blame(&rates);
+            return self.poisson(&t, &rates);
+        }
         match t.either("trace", "rates") {
             (None, None) => Err(t.missing("trace", "trace = \"FILE.csv\", or rates = [...]")),
             (Some(_), Some(rates)) => {
@@ -129,6 +145,9 @@ impl DemandReader<'_> {
 
     /// Name for messages and contents of a trace.
     fn open(&self, path: &str, field: &Field<'_>) -> Result<(String, Vec<u8>), ScenarioError> {
+        if let Some(text) = crate::scenario::embedded::named_trace(path) {
+            return Ok((format!("<embedded>/{path}"), text.as_bytes().to_vec()));
+        }
         let file = match &self.base {
             TraceBase::Directory(directory) => directory.join(path),
             TraceBase::Embedded => match crate::scenario::embedded::trace(path) {
@@ -240,6 +259,16 @@ impl DemandReader<'_> {
             }
         }
     }
+}
+
+/// Whether a list of seeds has this one.
+fn lists(seeds: &Field<'_>, seed: u64) -> Result<bool, ScenarioError> {
+    const SEEDS: &str = "a list of seeds, integers from 0 to 2^64 - 1";
+    let mut is_listed = false;
+    for item in seeds.items(SEEDS)? {
+        is_listed |= item.integer::<u64>(0, SEEDS)? == seed;
+    }
+    Ok(is_listed)
 }
 
 /// Line, from 1, of the record at a position. The csv crate's position is before the blank lines it skips.
