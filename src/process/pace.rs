@@ -49,8 +49,8 @@ impl OnMiss {
 pub struct Timing {
     /// When steps begin.
     pub pace: Pace,
-    /// Time from a step's beginning to its deadline; by default the step length when paced, and none
-    /// otherwise.
+    /// Time from a step's beginning, on time, to its deadline; by default the step length when paced, and none
+    /// otherwise. A step that begins late has at least half of it.
     pub deadline: Option<Duration>,
     /// What happens when a deadline is missed.
     pub on_miss: OnMiss,
@@ -69,7 +69,7 @@ pub struct Punctuality {
     pub missed_steps: u64,
     /// Of these, steps that only began after their deadlines, because those before them took too long.
     pub began_late: u64,
-    /// Who had not answered by then, and in how many steps.
+    /// Who had not answered by the deadline, and in how many steps; those that began late have one too.
     pub missed_by: Vec<MissedBy>,
     /// How long after its scheduled instant each step's state was published, ns; all 0 in a free run.
     pub lateness_ns: Percentiles,
@@ -92,6 +92,8 @@ pub(super) struct Pacer {
     /// Scheduled beginning of the first step, and its number.
     origin: Option<(Instant, u64)>,
     deadline: Option<Instant>,
+    /// The present step began after the deadline it would have had on time.
+    began_late: bool,
     missed_steps: u64,
     missed_by: Vec<(Role, u32, u64)>,
     /// Missed steps that began after their deadlines.
@@ -109,6 +111,7 @@ impl Pacer {
             step_length: Duration::from_nanos(dt_ns),
             origin: None,
             deadline: None,
+            began_late: false,
             missed_steps: 0,
             missed_by: Vec::new(),
             backlog: 0,
@@ -147,12 +150,12 @@ impl Pacer {
         let start = if self.timing.pace == Pace::Free { now } else { self.due(step) };
         // Only an absurd lateness could not be recorded.
         let _ = self.lateness_ns.record(now.saturating_duration_since(start).as_nanos() as u64);
-        let deadline = start + self.timing.deadline.unwrap_or(self.step_length);
-        if now < deadline {
-            self.deadline = Some(deadline);
-        } else {
+        let allowed = self.timing.deadline.unwrap_or(self.step_length);
+        self.began_late = now >= start + allowed;
+        // Half of it is left to every step: late ones wait for nobody without end, and make up for lost time.
+        self.deadline = Some((start + allowed).max(now + allowed / 2));
+        if self.began_late {
             // Whoever held up the steps before has been counted there.
-            self.deadline = None;
             self.missed_steps += 1;
             self.backlog += 1;
         }
@@ -164,7 +167,8 @@ impl Pacer {
             return false;
         }
         self.deadline = None;
-        self.missed_steps += 1;
+        // One that began late has been counted when it began.
+        self.missed_steps += u64::from(!self.began_late);
         for index in (0..64).filter(|i| awaited.missing >> i & 1 == 1) {
             match self.missed_by.iter_mut().find(|(role, i, _)| (*role, *i) == (awaited.role, index)) {
                 Some((.., steps)) => *steps += 1,
@@ -223,5 +227,28 @@ mod tests {
         let report = pacer.report(&ControllerNames::default()).expect("there was a schedule");
         let by = |i: usize| (report.missed_by[i].participant.as_str(), report.missed_by[i].steps);
         assert_eq!((report.missed_steps, by(0), by(1)), (2, ("controller 0", 1), ("controller 2", 2)));
+    }
+
+    /// It used to have none: nobody was fallen back on while the world was behind, which is when it matters.
+    #[test]
+    fn a_step_that_begins_late_has_a_deadline_and_counts_once() {
+        let timing = Timing { pace: Pace::Realtime, deadline: None, on_miss: OnMiss::Hold };
+        let mut pacer = Pacer::new(timing, 1_000_000);
+        let awaited = Awaited { role: Role::Controller, missing: 1, what: "commands", step: 0 };
+        assert_eq!(pacer.until(0), None);
+        let origin = pacer.due(0);
+        while Instant::now() < origin + Duration::from_millis(5) {}
+        // Steps 1 and 2 were due long ago; step 2 is answered in time.
+        for (step, is_answered) in [(1, false), (2, true)] {
+            pacer.begin(step);
+            let deadline = pacer.deadline.expect("every step has a deadline");
+            assert!(deadline >= origin + Duration::from_micros(5500), "half a step after its beginning");
+            while !is_answered && !pacer.has_missed(&awaited) {
+                assert!(origin.elapsed() < Duration::from_secs(60), "no deadline in a minute");
+            }
+        }
+        let report = pacer.report(&ControllerNames::default()).expect("there was a schedule");
+        assert_eq!((report.missed_steps, report.began_late), (2, 2));
+        assert_eq!(report.missed_by.iter().map(|by| by.steps).sum::<u64>(), 1);
     }
 }
