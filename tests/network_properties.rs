@@ -138,7 +138,12 @@ fn network(raw: &[RawZone]) -> Network {
         }
         if let Some(path) = sources[down].iter().position(Option::is_none) {
             sources[down][path] = Some(Source::Zone(i as u32));
-            exits[i] = Exit::Zone { zone: down as u32, path: path as u32, link_m: zone.link_m };
+            exits[i] = Exit::Zone {
+                zone: down as u32,
+                path: path as u32,
+                link_m: zone.link_m,
+                link_speed_mps: 15.0,
+            };
         }
     }
     let mut roads = Vec::new();

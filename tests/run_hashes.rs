@@ -15,8 +15,8 @@ use std::sync::Mutex;
 const GOLDEN: [(&str, [&str; 3]); 4] = [
     ("two-merges", ["4bd61fbe17f858e7", "33da63d44a5bf155", "9cce8ee0eb8c9bc4"]),
     ("varying-demand", ["e0a8fbeaddf7c3f7", "3eddbb8299ff70ac", "19983e4ca67be674"]),
-    ("corridor-8", ["c1e909f88f40aabe", "5e77a80a0cd287d8", "2d5a59944aac8edb"]),
-    ("tree", ["6feb76db58ddc81c", "b0c514522b0c5c78", "97199d953b03c4a3"]),
+    ("corridor-8", ["d425c59c87e7a4b8", "225fd381739e7d40", "85c790b27f020fd8"]),
+    ("tree", ["6c1acb542981b708", "0ce3fe74a4973a12", "ef6bc45f3bdaf8e8"]),
 ];
 
 /// Runs of several processes keep two cores busy: one at a time is faster than two.

@@ -417,7 +417,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "length_m = 200",
         "lenght_m = 200",
-        "s.toml:29: zones.first.approaches.a.lenght_m = 200: unknown key; expected one of name, length_m, road, zone, link_m; did you mean length_m?",
+        "s.toml:29: zones.first.approaches.a.lenght_m = 200: unknown key; expected one of name, length_m, road, zone, link_m, link_speed_mps; did you mean length_m?",
     ),
     (
         "link_m = 40",
@@ -782,7 +782,7 @@ fn every_seed_runs_and_those_with_a_trace_have_it() {
     let message = error("roads.main1.demand.trace_seeds=[1,-2]");
     assert!(message.contains("trace_seeds.1 = -2: expected a list of seeds, integers from 0"), "{message}");
     let message = error("roads.main1.demand={trace=\"sumo-400-1\",trace_seeds=[1]}");
-    assert!(message.contains("roads.main1.demand.rates: missing; expected trace and rates"), "{message}");
+    assert!(message.contains("roads.main1.demand.rates: missing key; expected trace and rates"), "{message}");
 }
 
 #[test]

@@ -4,8 +4,8 @@ use super::show::number;
 use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
 use crate::process::{LatencyUs, Outcome, Punctuality, Replacement, Settled};
-use crate::scenario::{Scenario, ShieldMode};
-use crate::world::{FaultCounts, OverlapSummary, ShieldSummary, ZoneSummaryRow};
+use crate::scenario::{Demand, Road, Scenario, ShieldMode};
+use crate::world::{FaultCounts, OverlapSummary, ShieldSummary, Stall, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
 use serde::Serialize;
 use std::path::Path;
@@ -15,6 +15,8 @@ use std::path::Path;
 pub(super) struct Summary {
     scenario: String,
     seed: u64,
+    /// Where vehicles come from.
+    arrivals: &'static str,
     transport: &'static str,
     processes: u32,
     steps: u64,
@@ -30,6 +32,7 @@ pub(super) struct Summary {
     held_arrivals: u32,
     waiting: u32,
     overlaps: OverlapSummary,
+    stalled: Vec<Stall>,
     shield: ShieldSummary,
     #[serde(skip_serializing_if = "Option::is_none")]
     faults: Option<FaultCounts>,
@@ -73,6 +76,7 @@ impl Summary {
         Summary {
             scenario: scenario.name.clone(),
             seed: scenario.seed,
+            arrivals: arrivals(scenario),
             transport,
             processes,
             steps: world.steps,
@@ -88,6 +92,7 @@ impl Summary {
             held_arrivals: world.held_arrivals,
             waiting: world.waiting,
             overlaps: world.overlaps,
+            stalled: world.stalled,
             shield: world.shield,
             faults: world.faults,
             replacements: outcome.replacements,
@@ -126,7 +131,26 @@ impl Summary {
 
     /// What makes the results doubtful, a line each.
     fn warnings(&self) -> Vec<String> {
-        self.overlap_line().into_iter().collect()
+        let mut warnings: Vec<String> = self.overlap_line().into_iter().collect();
+        let zones = self.stalled.iter().map(|stall| {
+            format!(
+                "nothing moves in {} since step {} ({:.1} s), {} inside: the run made no progress there",
+                stall.zone,
+                stall.since_step,
+                stall.since_s,
+                number(stall.vehicles.into(), "vehicle")
+            )
+        });
+        warnings.extend(zones);
+        let is_on = self.shield.mode == ShieldMode::On;
+        let replaced = self.shield.controllers.iter().filter(|row| is_on && row.bounded > row.commands / 2);
+        warnings.extend(replaced.map(|row| {
+            format!(
+                "controller {} hardly drove: the shield replaced {} of its {} commands ({} were no number)",
+                row.controller, row.bounded, row.commands, row.not_finite
+            )
+        }));
+        warnings
     }
 
     fn overlap_line(&self) -> Option<String> {
@@ -190,7 +214,7 @@ impl Summary {
         let l = &self.step_latency_us;
         let mut text = format!(
             "{}, seed {}: {} steps of {} s {how}, {:.2} s wall time\n{table}\n\
-             step latency p50 {:.1} µs, p99 {:.1}, p99.9 {:.1}, max {:.1}; beta {:.4}\n",
+             step latency p50 {:.1} µs, p99 {:.1}, p99.9 {:.1}, max {:.1}; beta {:.4}; arrivals from {}\n",
             self.scenario,
             self.seed,
             self.steps,
@@ -200,7 +224,8 @@ impl Summary {
             l.p99,
             l.p999,
             l.max,
-            self.beta
+            self.beta,
+            self.arrivals
         );
         if self.held_arrivals > 0 {
             text.push_str(&format!(
@@ -214,10 +239,10 @@ impl Summary {
                 self.arrived - self.departed
             ));
         }
-        if let Some(line) = self.overlap_line() {
-            text.push_str(&format!("{line}\n"));
-        }
         shield_lines(&self.shield, &mut text);
+        for warning in self.warnings() {
+            text.push_str(&format!("warning: {warning}\n"));
+        }
         if let Some(f) = &self.faults {
             text.push_str(&format!(
                 "faults: commands {} lost, {} delayed, {} stalled; records {} noisy, {} biased, {} frozen\n",
@@ -246,6 +271,16 @@ impl Summary {
         }
         text.push_str(&format!("state hash {}\n", self.state_hash));
         text
+    }
+}
+
+/// What a scenario's arrivals come from.
+fn arrivals(scenario: &Scenario) -> &'static str {
+    let is_trace = |road: &Road| matches!(road.demand, Demand::Trace(_));
+    match scenario.network.roads.iter().filter(|road| is_trace(road)).count() {
+        0 => "the seed",
+        traces if traces == scenario.network.roads.len() => "traces",
+        _ => "traces and the seed",
     }
 }
 
@@ -280,12 +315,12 @@ fn shield_lines(shield: &ShieldSummary, text: &mut String) {
         return;
     }
     for row in &shield.controllers {
-        let acts = row.not_finite + row.limits + row.speed + row.rear_end + row.merge;
         text.push_str(&format!(
-            "shield {}, {}: {acts} of {} commands bounded (rear end {}, merge {}, speed {}, limits {}, no \
+            "shield {}, {}: {} of {} commands bounded (by rear end {}, merge {}, speed {}, limits {}, no \
              number {}); least margins of guaranteed vehicles {} / {} m; {} pairs began unsafe\n",
             shield.mode.name(),
             row.controller,
+            row.bounded,
             row.commands,
             row.rear_end,
             row.merge,

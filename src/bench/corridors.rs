@@ -35,8 +35,8 @@ pub fn corridors(vehicles: usize, until_s: f64) -> Result<Scenario, ScenarioErro
                     .collect(),
                 exit: match zone.exit {
                     Exit::Out => Exit::Out,
-                    Exit::Zone { zone, path, link_m } => {
-                        Exit::Zone { zone: zone + i * zones_per, path, link_m }
+                    Exit::Zone { zone, path, link_m, link_speed_mps } => {
+                        Exit::Zone { zone: zone + i * zones_per, path, link_m, link_speed_mps }
                     }
                 },
                 flow: zone.flow.clone(),

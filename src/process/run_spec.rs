@@ -28,7 +28,7 @@ fn approaches<'a>(
         (0..).zip(&z.approaches).map(move |(path, approach)| {
             let (next_zone, next_path, link_m) = match z.exit {
                 Exit::Out => (frames::NO_ZONE, 0, 0.0),
-                Exit::Zone { zone, path, link_m } => (zone, path, link_m),
+                Exit::Zone { zone, path, link_m, .. } => (zone, path, link_m),
             };
             let controller = drivers.of(zone, path);
             let flags = if controller == index { frames::APPROACH_OWN } else { 0 };

@@ -51,7 +51,7 @@ impl Scenario {
         }
         within("slack_weight", control.slack_weight, &ranges::SLACK_WEIGHT)?;
         number("fe_fraction", control.fe_fraction, |f| f > 0.0 && f <= 1.0)?;
-        network(&self.network, self.vehicle.v_max_mps * dt_s)?;
+        network(&self.network, self.vehicle.v_max_mps * dt_s, self.vehicle.v_max_mps)?;
         for zone in &self.network.zones {
             flow(zone, &self.network, self.vehicle.v_max_mps)?;
         }
@@ -141,7 +141,7 @@ fn vehicle(v: &VehicleParams) -> Check {
 }
 
 /// Indices point at something, both ends of a connection know of each other, and zones come upstream first.
-fn network(network: &Network, step_m: f64) -> Check {
+fn network(network: &Network, step_m: f64, v_max_mps: f64) -> Check {
     let (zones, roads) = (&network.zones, &network.roads);
     require(!zones.is_empty() && zones.len() <= MAX_COUNT, || format!("{} zones", zones.len()))?;
     require(!roads.is_empty() && roads.len() <= MAX_COUNT, || format!("{} roads", roads.len()))?;
@@ -166,11 +166,12 @@ fn network(network: &Network, step_m: f64) -> Check {
                 }
             }
         }
-        if let Exit::Zone { zone: down, path, link_m } = zone.exit {
+        if let Exit::Zone { zone: down, path, link_m, link_speed_mps } = zone.exit {
             let source = zones.get(down as usize).and_then(|z| z.approaches.get(path as usize));
             require(source.is_some_and(|a| a.source == Source::Zone(index)), bad)?;
             within("link_m", link_m, &ranges::LINK_LENGTH)?;
             number("link_m", link_m, |l| l == 0.0 || l >= step_m)?;
+            number("link_speed_mps", link_speed_mps, |v| ranges::LINK_SPEED.contains(v) && v <= v_max_mps)?;
         }
     }
     require(roads_used == roads.len(), || "a road that leads nowhere".to_owned())

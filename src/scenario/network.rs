@@ -62,6 +62,8 @@ pub enum Exit {
         path: u32,
         /// Length of the uncontrolled link in between, m.
         link_m: f64,
+        /// Speed driven on that link where nobody is in the way, m/s; without meaning when there is none.
+        link_speed_mps: f64,
     },
 }
 

@@ -45,6 +45,8 @@ pub(super) const SLACK_WEIGHT: Range = Range { zero: true, ..range("a weight", 1
 pub(super) const APPROACH_LENGTH: Range = range("a length", 1.0, 1e6, "m");
 /// `zones.approaches.link_m`.
 pub(super) const LINK_LENGTH: Range = Range { zero: true, ..range("a length", 1.0, 1e6, "m") };
+/// `zones.approaches.link_speed_mps`, which does not exceed `v_max_mps` either.
+pub(super) const LINK_SPEED: Range = range("a speed", 0.01, 1000.0, "m/s");
 /// Terminal speeds of flow policies, which do not exceed `v_max_mps` either.
 pub(super) const FLOW_SPEED: Range = range("a speed", 0.01, 1000.0, "m/s");
 /// `gain_mps` of flow policies.

@@ -39,6 +39,8 @@ pub(super) struct Visit {
     /// Entered during the step just ended.
     pub entered: bool,
     pub infeasible: bool,
+    /// Whether the command in force was no number or beyond the limits as it came.
+    pub beyond: bool,
     /// Whether all rear-end (merging) entry conditions held at the first sample in the zone.
     pub clean_rear_end: bool,
     pub clean_merge: bool,
@@ -66,6 +68,7 @@ impl Visit {
         entered: true,
         verdict: VERDICT_NOMINAL,
         infeasible: false,
+        beyond: false,
         clean_rear_end: true,
         clean_merge: true,
     };

@@ -7,7 +7,7 @@
 
 use super::car::{Car, Guard};
 use super::faults::Limits;
-use super::link::LinkCar;
+use super::link::{Link, LinkCar};
 use super::metrics::{ShieldRow, ShieldSummary};
 use super::role::World;
 use crate::lanes::AHEAD;
@@ -245,15 +245,18 @@ impl World {
                     return Err(CommandFault::BadVerdict { record, vehicle, verdict });
                 }
                 let mut u = command.u_mps2;
+                car.visit.beyond = false;
                 let (min_mps2, max_mps2) = (limits.u_min_mps2, limits.u_max_mps2);
                 // Written so that NaN is no exception.
                 if !(u >= min_mps2 && u <= max_mps2) {
                     match *mode {
                         ShieldMode::On if u.is_finite() => {
+                            car.visit.beyond = true;
                             beyond += 1;
                             u = u.clamp(min_mps2, max_mps2);
                         }
                         ShieldMode::On => {
+                            car.visit.beyond = true;
                             not_finite += 1;
                             u = min_mps2;
                         }
@@ -465,6 +468,7 @@ impl World {
             let row = &mut rows[drivers.of(zone as u32, car.path) as usize];
             row.commands += 1;
             let found = shield.project(car.x_m, car.v_mps, car.command_mps2, partners.iter().copied());
+            row.bounded += u64::from(car.visit.beyond || found.row.is_some());
             match found.row {
                 None => {}
                 Some(Row::Speed) => row.speed += 1,
@@ -498,12 +502,13 @@ impl World {
         if self.links[zone].cars.is_empty() {
             return;
         }
-        let Exit::Zone { zone: down, path, link_m } = scenario.network.zones[zone].exit else { return };
+        let Exit::Zone { zone: down, path, link_m, .. } = scenario.network.zones[zone].exit else { return };
         let last = self.members(down as usize).iter().rev().find(|c| c.path == path);
         let mut leader = last.map(|c| Held::new(c.x_m + link_m, c.v_mps, c.command_mps2));
-        for LinkCar { car, held } in &mut self.links[zone].cars {
+        let Link { speed_mps, cars, .. } = &mut self.links[zone];
+        for LinkCar { car, held } in cars {
             let k = scenario.control.k_rear_end_per_s;
-            let mut u = super::link::drive(car, leader.as_ref(), &scenario.vehicle, k, dt_s);
+            let mut u = super::link::drive(car, *speed_mps, leader.as_ref(), &scenario.vehicle, k, dt_s);
             if self.gateway.mode == ShieldMode::On {
                 let partner = leader.map(|motion| Partner { duty: Duty::RearEnd, motion });
                 u = self.gateway.shield.project(car.x_m, car.v_mps, u, partner.into_iter()).u_mps2;

@@ -175,7 +175,7 @@ impl World {
             } else {
                 pass_over(&car, &held, zone as ZoneId);
             }
-            let Exit::Zone { zone: down, path, link_m } = site.exit else {
+            let Exit::Zone { zone: down, path, link_m, .. } = site.exit else {
                 self.departed += 1;
                 continue;
             };
@@ -212,7 +212,7 @@ impl World {
     /// Takes vehicles off the end of a link into the next zone.
     fn leave_link(&mut self, zone: usize, now_s: f64, dt_s: f64) {
         let Exit::Zone { zone: down, path, .. } = self.sites[zone].exit else { return };
-        let Link { length_m, cars } = &mut self.links[zone];
+        let Link { length_m, cars, .. } = &mut self.links[zone];
         let mut at = 0;
         // All of them: where one has passed another, the first in the list is not the foremost.
         while let Some(LinkCar { car, held }) = cars.get(at) {
@@ -278,11 +278,14 @@ impl World {
         for (car, held) in left.iter_mut().zip(left_motions) {
             car.move_on(held, dt_s);
         }
+        let mut fastest_mps = -1.0_f64;
         for (car, held) in members.iter_mut().zip(motions) {
             car.visit.energy += held.energy(dt_s);
             car.visit.entered = false;
             car.move_on(held, dt_s);
+            fastest_mps = fastest_mps.max(car.v_mps);
         }
+        self.standstills.observe(zone, self.step + 1, fastest_mps);
     }
 
     /// Appends the newcomers to their zones, by instant of entry, then path.

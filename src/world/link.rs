@@ -8,6 +8,8 @@ use crate::vehicle::{Held, Pair, RearEnd};
 #[derive(Clone, Debug, Default)]
 pub(super) struct Link {
     pub length_m: f64,
+    /// Speed driven on it where nobody is in the way, m/s.
+    pub speed_mps: f64,
     pub cars: Vec<LinkCar>,
 }
 
@@ -20,19 +22,20 @@ pub(super) struct LinkCar {
     pub held: Held,
 }
 
-/// Time constant with which a vehicle on a link goes back to the speed it entered with, s.
+/// Time constant with which a vehicle on a link goes over to the link's speed, s.
 const RECOVERY_S: f64 = 2.0;
 
-/// The acceleration a vehicle on a link chooses: back to its entry speed, unless the sampled rear-end
+/// The acceleration a vehicle on a link chooses: toward the link's speed, unless the sampled rear-end
 /// condition asks for less. `leader` is the motion of the vehicle ahead, in the link's coordinate.
 pub(super) fn drive(
     car: &Car,
+    link_speed_mps: f64,
     leader: Option<&Held>,
     vehicle: &VehicleParams,
     k_per_s: f64,
     dt_s: f64,
 ) -> f64 {
-    let wish = (car.entry_speed_mps - car.v_mps) / RECOVERY_S;
+    let wish = (link_speed_mps - car.v_mps) / RECOVERY_S;
     let Some(leader) = leader else { return wish.clamp(vehicle.u_min_mps2, vehicle.u_max_mps2) };
     let rear_end = RearEnd {
         reaction_s: vehicle.reaction_time_s,

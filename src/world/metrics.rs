@@ -2,6 +2,7 @@
 
 use super::car::Visit;
 use super::overlap::OverlapSummary;
+use super::standstill::Stall;
 use crate::scenario::ShieldMode;
 use serde::{Deserialize, Serialize};
 
@@ -171,6 +172,8 @@ pub struct WorldSummary {
     pub zones: Vec<ZoneSummaryRow>,
     /// Bodies that overlapped.
     pub overlaps: OverlapSummary,
+    /// Zones in which nothing moved any more when the run ended.
+    pub stalled: Vec<Stall>,
     /// What the gateway did.
     pub shield: ShieldSummary,
     /// What went wrong on purpose, if anything was to.
@@ -203,13 +206,16 @@ pub struct ShieldSummary {
     pub controllers: Vec<ShieldRow>,
 }
 
-/// Interventions in one controller's commands; in `observe` mode, those that were called for.
+/// Interventions in one controller's commands; in `observe` mode, those that were called for. A command may
+/// count under several reasons: beyond the limits, and then bounded by a margin.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ShieldRow {
     /// Controller name.
     pub controller: String,
-    /// Commands looked at.
+    /// Commands looked at: one per vehicle and step.
     pub commands: u64,
+    /// Of these, commands that were changed, each counted once whatever changed it.
+    pub bounded: u64,
     /// Commands that were no number, replaced by `u_min`.
     pub not_finite: u64,
     /// Commands beyond the vehicle's limits, clamped.

@@ -10,9 +10,11 @@ mod link;
 mod metrics;
 mod overlap;
 mod role;
+mod standstill;
 
 pub use change::ChangeError;
 pub use gateway::CommandFault;
 pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
 pub use overlap::{FirstOverlap, OverlapSummary};
 pub use role::{CoordinatorMasks, Sheet, World};
+pub use standstill::Stall;

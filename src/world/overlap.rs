@@ -213,7 +213,7 @@ impl World {
                         self.overlaps.compare(look, own, (other.vehicle, &other.held()), shift_m, after_s);
                     }
                 }
-                Exit::Zone { zone: down, path, link_m } => {
+                Exit::Zone { zone: down, path, link_m, .. } => {
                     for link_car in &self.links[zone].cars {
                         if !self.has_left_on(zone, car.path, link_car.car.vehicle) {
                             let other = (link_car.car.vehicle, &link_car.held);
@@ -257,7 +257,7 @@ impl World {
 
     /// Looks at the vehicles on the link behind a zone, and at those that have just left it.
     pub(super) fn observe_link_overlaps(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) {
-        let Exit::Zone { zone: down, path, link_m } = self.sites[zone].exit else { return };
+        let Exit::Zone { zone: down, path, link_m, .. } = self.sites[zone].exit else { return };
         let look = Look { scenario, zone, step: self.step, dt_s };
         let body_m = scenario.vehicle.length_m;
         if self.links[zone].cars.is_empty() {

@@ -8,6 +8,7 @@ use super::integrate::{Entry, Leader};
 use super::link::Link;
 use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics};
 use super::overlap::Overlaps;
+use super::standstill::Standstills;
 use crate::lanes::{AHEAD, Lanes};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Exit, Scenario, ZoneId};
@@ -42,6 +43,7 @@ pub struct World {
     pub(super) departed: u32,
     pub(super) metrics: Vec<ZoneMetrics>,
     pub(super) overlaps: Overlaps,
+    pub(super) standstills: Standstills,
     /// Completed visits in the order in which they ended, when they are recorded.
     pub(super) visits: Option<Vec<CompletedVisit>>,
     /// Zones that had an event in the step just ended, ascending.
@@ -130,7 +132,9 @@ impl World {
             .zones
             .iter()
             .map(|z| match z.exit {
-                Exit::Zone { link_m, .. } => Link { length_m: link_m, cars: Vec::new() },
+                Exit::Zone { link_m, link_speed_mps, .. } => {
+                    Link { length_m: link_m, speed_mps: link_speed_mps, cars: Vec::new() }
+                }
                 Exit::Out => Link::default(),
             })
             .collect();
@@ -148,6 +152,7 @@ impl World {
             departed: 0,
             metrics: vec![ZoneMetrics::default(); zones],
             overlaps: Overlaps::new(zones),
+            standstills: Standstills::new(zones),
             visits: None,
             events: Vec::new(),
             scratch: Scratch::default(),
@@ -389,6 +394,7 @@ impl World {
             held_arrivals: self.gates.held,
             waiting: self.gates.waiting.iter().map(|w| w.len() as u32).sum(),
             overlaps: self.overlaps.summary(),
+            stalled: self.stalls(),
             shield: self.gateway.summary(),
             faults: self.faults.as_ref().map(|faults| faults.counts()),
             zones: zones

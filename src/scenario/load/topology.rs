@@ -37,19 +37,20 @@ pub(super) fn unique_names<'a>(tables: &[Table<'a>], what: &str) -> Result<Vec<&
     Ok(names)
 }
 
-/// Reads all approaches; `step_m` is the farthest a vehicle may go in one step.
+/// Reads all approaches; `step_m` is the farthest a vehicle may go in one step, at `v_max_mps`.
 pub(super) fn read(
     zones: &[Table<'_>],
     zone_names: &[&str],
     roads: &[Table<'_>],
     road_names: &[&str],
-    step_m: f64,
+    (step_m, v_max_mps): (f64, f64),
 ) -> Result<Topology, ScenarioError> {
     let mut claims = Claims {
         exits: vec![None; zones.len()],
         roads: vec![None; roads.len()],
         exit_fields: vec![None; zones.len()],
         step_m,
+        v_max_mps,
     };
     let mut approaches = Vec::with_capacity(zones.len());
     for (zone, table) in zones.iter().enumerate() {
@@ -92,7 +93,10 @@ pub(super) fn read(
             .collect(),
         exit: match claims.exits[old] {
             None => Exit::Out,
-            Some((zone, path, link_m)) => Exit::Zone { zone: sorted[zone as usize], path, link_m },
+            Some((zone, path, link)) => {
+                let (link_m, link_speed_mps) = link;
+                Exit::Zone { zone: sorted[zone as usize], path, link_m, link_speed_mps }
+            }
         },
         flow: FlowPolicy::None,
     });
@@ -103,13 +107,14 @@ pub(super) fn read(
 
 /// Who uses which exit and which road, by indices as declared.
 struct Claims<'a> {
-    /// Zone, approach and link length.
-    exits: Vec<Option<(u32, u32, f64)>>,
+    /// Zone, approach, and the link's length and speed.
+    exits: Vec<Option<(u32, u32, (f64, f64))>>,
     /// The `zone` key that claimed each exit, for messages.
     exit_fields: Vec<Option<Field<'a>>>,
     /// Zone, approach, and the key path that claimed it.
     roads: Vec<Option<(u32, u32, String)>>,
     step_m: f64,
+    v_max_mps: f64,
 }
 
 impl<'a> Claims<'a> {
@@ -121,7 +126,7 @@ impl<'a> Claims<'a> {
         zone_names: &[&str],
         road_names: &[&str],
     ) -> Result<Approach, ScenarioError> {
-        t.only(&["name", "length_m", "road", "zone", "link_m"])?;
+        t.only(&["name", "length_m", "road", "zone", "link_m", "link_speed_mps"])?;
         let step_m = self.step_m;
         let why = "v_max_mps * dt_s, so that a vehicle passes at most one boundary per step";
         let (length, link) = (ranges::APPROACH_LENGTH, ranges::LINK_LENGTH);
@@ -145,9 +150,11 @@ impl<'a> Claims<'a> {
                 }
                 self.roads[road] = Some((end.0, end.1, t.key("road")));
                 // A road by --set in place of the file's zone leaves that zone's link without meaning.
-                if let Some(link) = t.get("link_m").filter(|link| link.is_set() || !field.is_set()) {
-                    let problem = Some("the source is a road".to_owned());
-                    return Err(link.bad_because(problem, "link_m only with zone"));
+                for key in ["link_m", "link_speed_mps"] {
+                    if let Some(link) = t.get(key).filter(|link| link.is_set() || !field.is_set()) {
+                        let problem = Some("the source is a road".to_owned());
+                        return Err(link.bad_because(problem, &format!("{key} only with zone")));
+                    }
                 }
                 Source::Road(road as u32)
             }
@@ -160,7 +167,11 @@ impl<'a> Claims<'a> {
                 let expected = format!("{link}, >= {step_m} m = {why}");
                 let is_link = |l| link.contains(l) && (l == 0.0 || l >= step_m);
                 let link_m = t.f64_or("link_m", 0.0, is_link, &expected)?;
-                self.exits[upstream] = Some((end.0, end.1, link_m));
+                let v_max_mps = self.v_max_mps;
+                let expected = format!("{}, <= v_max_mps = {v_max_mps}", ranges::LINK_SPEED);
+                let is_speed = |v| ranges::LINK_SPEED.contains(v) && v <= v_max_mps;
+                let link_speed_mps = t.f64_or("link_speed_mps", v_max_mps / 2.0, is_speed, &expected)?;
+                self.exits[upstream] = Some((end.0, end.1, (link_m, link_speed_mps)));
                 self.exit_fields[upstream] = Some(field);
                 Source::Zone(upstream as u32)
             }
@@ -265,7 +276,7 @@ mod tests {
         assert_eq!(names, ["x", "first", "mid", "last"]);
         assert_eq!(n.zones[3].approaches[0].source, Source::Zone(2));
         assert_eq!(n.zones[2].approaches[0].source, Source::Zone(1));
-        assert_eq!(n.zones[1].exit, Exit::Zone { zone: 2, path: 0, link_m: 0.0 });
+        assert_eq!(n.zones[1].exit, Exit::Zone { zone: 2, path: 0, link_m: 0.0, link_speed_mps: 15.0 });
         assert_eq!(n.zones[0].exit, Exit::Out);
         for (index, road) in n.roads.iter().enumerate() {
             let approach = &n.zones[road.zone as usize].approaches[road.path as usize];
