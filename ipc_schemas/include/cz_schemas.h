@@ -105,12 +105,14 @@
 #define CZ_ATTACH_READY UINT32_C(2)
 /** `cz_attach_request_t.phase`: has fallen behind the run and asks for what it needs to catch up. */
 #define CZ_ATTACH_RESTORE UINT32_C(3)
-/** `cz_attach_reply_t.waiting`: hot processes poll, coordinators sleep. */
+/** `cz_attach_reply_t.waiting`: world and controllers poll, coordinators sleep. */
 #define CZ_WAITING_HYBRID UINT32_C(0)
 /** `cz_attach_reply_t.waiting`: everyone spins. */
 #define CZ_WAITING_SPIN UINT32_C(1)
 /** `cz_attach_reply_t.waiting`: everyone sleeps until rung. */
 #define CZ_WAITING_BLOCK UINT32_C(2)
+/** `cz_attach_reply_t.waiting`: everyone polls while that pays, and sleeps until rung otherwise. */
+#define CZ_WAITING_ADAPTIVE UINT32_C(3)
 /** `cz_attach_reply_t.status`: welcome; the other fields and the scenario bytes are valid. */
 #define CZ_ATTACH_ACCEPTED UINT32_C(0)
 /** `cz_attach_reply_t.status`: the participant's schema hash is not the world's. */
@@ -168,13 +170,6 @@
 /** World -> whoever records the run: every step as one block of bytes. Overflows, so that nobody
  *  waits for its reader. */
 #define CZ_SERVICE_OBSERVER "cz/observer"
-/** Bell of the world, rung by controllers when everyone blocks. */
-#define CZ_BELL_WORLD "cz/bell/world"
-/** Bell of coordinator `i`; `i` is appended. */
-#define CZ_BELL_COORDINATOR_PREFIX "cz/bell/coordinator/"
-/** Bell of controller `i`, rung by the world and coordinators when everyone blocks; `i` is
- *  appended. */
-#define CZ_BELL_CONTROLLER_PREFIX "cz/bell/controller/"
 /** Participants -> world: `cz_attach_request_t`. */
 #define CZ_SERVICE_ATTACH "cz/attach"
 /** World -> participants: the scenario as bytes, behind the `cz_attach_reply_t`. */
@@ -469,8 +464,8 @@ typedef struct cz_attach_reply {
     uint32_t coordinators;
     /** Number of controller processes in the run. */
     uint32_t controllers;
-    /** How the processes of the run wait: 0 hybrid, 1 spin, 2 block. When they block, whoever sends
-     *  a frame rings its receivers' bells; in hybrid, only coordinators have bells. */
+    /** How the built-in processes of the run wait: 0 hybrid, 1 spin, 2 block, 3 adaptive. A plug-in
+     *  may wait as it likes: nobody rings for it, and the world does not expect it to ring. */
     uint32_t waiting;
     /** Zero. */
     uint32_t reserved;

@@ -81,12 +81,14 @@ ATTACH_JOIN = 1
 ATTACH_READY = 2
 #: `AttachRequest.phase`: has fallen behind the run and asks for what it needs to catch up.
 ATTACH_RESTORE = 3
-#: `AttachReply.waiting`: hot processes poll, coordinators sleep.
+#: `AttachReply.waiting`: world and controllers poll, coordinators sleep.
 WAITING_HYBRID = 0
 #: `AttachReply.waiting`: everyone spins.
 WAITING_SPIN = 1
 #: `AttachReply.waiting`: everyone sleeps until rung.
 WAITING_BLOCK = 2
+#: `AttachReply.waiting`: everyone polls while that pays, and sleeps until rung otherwise.
+WAITING_ADAPTIVE = 3
 #: `AttachReply.status`: welcome; the other fields and the scenario bytes are valid.
 ATTACH_ACCEPTED = 0
 #: `AttachReply.status`: the participant's schema hash is not the world's.
@@ -143,12 +145,6 @@ SERVICE_COMMAND = "cz/command"
 #: World → whoever records the run: every step as one block of bytes. Overflows, so that nobody
 #: waits for its reader.
 SERVICE_OBSERVER = "cz/observer"
-#: Bell of the world, rung by controllers when everyone blocks.
-BELL_WORLD = "cz/bell/world"
-#: Bell of coordinator `i`; `i` is appended.
-BELL_COORDINATOR_PREFIX = "cz/bell/coordinator/"
-#: Bell of controller `i`, rung by the world and coordinators when everyone blocks; `i` is appended.
-BELL_CONTROLLER_PREFIX = "cz/bell/controller/"
 #: Participants → world: `AttachRequest`.
 SERVICE_ATTACH = "cz/attach"
 #: World → participants: the scenario as bytes, behind the `AttachReply`.
@@ -421,9 +417,9 @@ class AttachReply(ctypes.Structure):
         index: Index assigned among the processes of the role.
         coordinators: Number of coordinator processes in the run.
         controllers: Number of controller processes in the run.
-        waiting: How the processes of the run wait: 0 hybrid, 1 spin, 2 block. When they block,
-            whoever sends a frame rings its receivers' bells; in hybrid, only coordinators have
-            bells.
+        waiting: How the built-in processes of the run wait: 0 hybrid, 1 spin, 2 block, 3 adaptive.
+            A plug-in may wait as it likes: nobody rings for it, and the world does not expect it to
+            ring.
         reserved: Zero.
     """
 

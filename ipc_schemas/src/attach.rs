@@ -20,12 +20,14 @@ codes! {
     /// [`AttachRequest::phase`]: has fallen behind the run and asks for what it needs to catch up.
     pub const ATTACH_RESTORE: u32 = 3;
 
-    /// [`AttachReply::waiting`]: hot processes poll, coordinators sleep.
+    /// [`AttachReply::waiting`]: world and controllers poll, coordinators sleep.
     pub const WAITING_HYBRID: u32 = 0;
     /// [`AttachReply::waiting`]: everyone spins.
     pub const WAITING_SPIN: u32 = 1;
     /// [`AttachReply::waiting`]: everyone sleeps until rung.
     pub const WAITING_BLOCK: u32 = 2;
+    /// [`AttachReply::waiting`]: everyone polls while that pays, and sleeps until rung otherwise.
+    pub const WAITING_ADAPTIVE: u32 = 3;
 
     /// [`AttachReply::status`]: welcome; the other fields and the scenario bytes are valid.
     pub const ATTACH_ACCEPTED: u32 = 0;
@@ -103,8 +105,8 @@ record! {
         pub coordinators: u32,
         /// Number of controller processes in the run.
         pub controllers: u32,
-        /// How the processes of the run wait: 0 hybrid, 1 spin, 2 block. When they block, whoever sends a
-        /// frame rings its receivers' bells; in hybrid, only coordinators have bells.
+        /// How the built-in processes of the run wait: 0 hybrid, 1 spin, 2 block, 3 adaptive. A plug-in may
+        /// wait as it likes: nobody rings for it, and the world does not expect it to ring.
         pub waiting: u32,
         /// Zero.
         pub reserved: u32,

@@ -17,12 +17,6 @@ codes! {
     /// World → whoever records the run: every step as one block of bytes. Overflows, so that nobody waits for
     /// its reader.
     pub const SERVICE_OBSERVER: &str = "cz/observer";
-    /// Bell of the world, rung by controllers when everyone blocks.
-    pub const BELL_WORLD: &str = "cz/bell/world";
-    /// Bell of coordinator `i`; `i` is appended.
-    pub const BELL_COORDINATOR_PREFIX: &str = "cz/bell/coordinator/";
-    /// Bell of controller `i`, rung by the world and coordinators when everyone blocks; `i` is appended.
-    pub const BELL_CONTROLLER_PREFIX: &str = "cz/bell/controller/";
     /// Participants → world: [`AttachRequest`](crate::AttachRequest).
     pub const SERVICE_ATTACH: &str = "cz/attach";
     /// World → participants: the scenario as bytes, behind the [`AttachReply`](crate::AttachReply).

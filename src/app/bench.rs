@@ -13,7 +13,7 @@ use crate::bench::{
 use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, new_run_id, run_in_process};
 use comfy_table::{CellAlignment, Table, presets};
 use std::path::Path;
-use std::process::{Command, Stdio};
+use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -41,6 +41,10 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
             let report = scale(args.measure.quick, args.with_sumo.then_some(args.sumo_up_to))?;
             deliver(args.measure.json.as_deref(), &report, &scale_table(&report))
         }
+        BenchKind::Wait(args) => {
+            let report = super::bench_wait::measure(args)?;
+            deliver(args.measure.json.as_deref(), &report, &super::bench_wait::table(&report))
+        }
         BenchKind::Peer(args) => peer(args),
     }
 }
@@ -57,12 +61,12 @@ fn deliver(json: Option<&Path>, report: &impl serde::Serialize, table: &str) -> 
 }
 
 /// The default scenario with the whole trace: ten times as many steps as `cz run` takes.
-fn scenario_of(quick: bool) -> ScenarioArgs {
+pub(super) fn scenario_of(quick: bool) -> ScenarioArgs {
     let set = if quick { vec![] } else { vec!["end.vehicles=600".to_owned()] };
     ScenarioArgs { scenario: None, seed: Some(1), set, corridors: None }
 }
 
-const WAIT: WaitArgs = WaitArgs {
+pub(super) const WAIT: WaitArgs = WaitArgs {
     attach_timeout: Duration::from_secs(30),
     peer_timeout: Duration::from_secs(30),
     pin: Placement::Auto,
@@ -74,19 +78,27 @@ fn run_processes(
     controllers: u32,
     record: Option<&Path>,
 ) -> Result<Outcome, String> {
+    let share = ShareArgs { ctrl_procs: controllers, coord_procs: 1 };
+    let restart = if record.is_some() { Restart::OnFailure } else { Restart::Never };
+    let (wait_mode, timing) = (WaitMode::default(), TimingArgs::default());
+    let conduct = ConductArgs { wait: WAIT, wait_mode, restart, timing, record_lag: None };
+    run_as(scenario, share, conduct, record)
+}
+
+/// Runs a scenario in processes of its own.
+pub(super) fn run_as(
+    scenario: &ScenarioArgs,
+    share: ShareArgs,
+    conduct: ConductArgs,
+    record: Option<&Path>,
+) -> Result<Outcome, String> {
     let plan = Plan {
         run: own_name(),
         scenario,
-        share: ShareArgs { ctrl_procs: controllers, coord_procs: 1 },
+        share,
         plugins: &[],
-        pool: controllers,
-        conduct: ConductArgs {
-            wait: WAIT,
-            wait_mode: WaitMode::Hybrid,
-            restart: if record.is_some() { Restart::OnFailure } else { Restart::Never },
-            timing: TimingArgs::default(),
-            record_lag: None,
-        },
+        pool: share.ctrl_procs,
+        conduct,
         run_id: new_run_id(),
         resume: None,
     };
@@ -108,11 +120,7 @@ fn run_processes(
 fn latency(quick: bool) -> Result<LatencyReport, AppError> {
     let arguments = scenario_of(quick);
     let scenario = Arc::new(arguments.load()?);
-    let start_peer = |kind: &[String]| {
-        let mut command = Command::new(std::env::current_exe()?);
-        command.args(["bench", "peer"]).args(arguments.to_flags()).args(kind);
-        command.stdin(Stdio::null()).spawn()
-    };
+    let start_peer = |kind: &[String]| start_peer(&arguments, kind);
     let options = LatencyOptions {
         scenario,
         round_trips: if quick { 20_000 } else { 200_000 },
@@ -128,7 +136,18 @@ fn latency(quick: bool) -> Result<LatencyReport, AppError> {
     Ok(bench::latency(&options)?)
 }
 
+/// Starts this program as the other process of a measurement.
+pub(super) fn start_peer(scenario: &ScenarioArgs, kind: &[String]) -> std::io::Result<Child> {
+    let mut command = Command::new(std::env::current_exe()?);
+    command.args(["bench", "peer"]).args(scenario.to_flags()).args(kind);
+    command.stdin(Stdio::null()).spawn()
+}
+
 fn peer(args: &PeerArgs) -> Result<(), AppError> {
+    if args.kind == "busy" {
+        bench::keep_busy();
+        return Ok(());
+    }
     let scenario = Arc::new(args.scenario.load()?);
     let bad = || AppError::Usage(format!("bench peer {} {:?}: not a peer", args.kind, args.values));
     let number = |i: usize| args.values.get(i).and_then(|v| v.parse::<u64>().ok()).ok_or_else(bad);
@@ -167,14 +186,14 @@ fn scale(quick: bool, sumo_up_to: Option<usize>) -> Result<ScaleReport, AppError
     })?)
 }
 
-fn table(header: &[&str]) -> Table {
+pub(super) fn table(header: &[&str]) -> Table {
     let mut table = Table::new();
     table.load_style(presets::UTF8_HORIZONTAL_ONLY);
     table.set_header(header.iter().copied());
     table
 }
 
-fn align(table: &mut Table) {
+pub(super) fn align(table: &mut Table) {
     for column in table.column_iter_mut().skip(1) {
         column.set_cell_alignment(CellAlignment::Right);
     }

@@ -5,6 +5,7 @@ use super::peer::{PATIENCE, receive};
 use super::shared_word::SharedWords;
 use super::socket::{Connection, Stream};
 use super::step::{Stepped, lead};
+use super::waiting::Timed;
 use super::{BenchError, io};
 use crate::process::{
     Affinity, Outcome, Percentiles, Placement, StopFlag, expected_vehicles, new_histogram, place,
@@ -94,7 +95,7 @@ pub fn latency(options: &LatencyOptions<'_>) -> Result<LatencyReport, BenchError
     let iceoryx2 = iceoryx2(options, affinity.as_ref(), mean_records.round() as usize)?;
     let processes = unplaced(affinity.as_ref(), options.run_processes).map_err(BenchError::Run)?;
     let recorded = unplaced(affinity.as_ref(), options.run_recorded).map_err(BenchError::Run)?;
-    let two = iceoryx2_step(options, affinity.as_ref())?;
+    let two = iceoryx2_step(scenario, options.start_peer, affinity.as_ref())?;
     let unix = socket_step(options, affinity.as_ref(), SocketKind::Unix)?;
     let tcp = socket_step(options, affinity.as_ref(), SocketKind::Tcp)?;
     for (name, hash) in [
@@ -160,28 +161,50 @@ impl Drop for Peer {
     }
 }
 
+/// A run of two processes, each on a core of its own and never asleep.
+pub fn two_processes(
+    scenario: &Arc<Scenario>,
+    start_peer: &dyn Fn(&[String]) -> std::io::Result<Child>,
+) -> Result<Timed, BenchError> {
+    let affinity = Affinity::current();
+    place(Placement::Auto, Role::World, 0);
+    let result = iceoryx2_step(scenario, start_peer, affinity.as_ref());
+    affinity.iter().for_each(Affinity::restore);
+    let Stepped { wall_s, all, steady, event, state_hash } = result?;
+    let us = |ns: u64| ns as f64 / 1e3;
+    Ok(Timed {
+        wall_s,
+        p50_us: us(all.p50),
+        p99_us: us(all.p99),
+        steady_p50_us: Some(us(steady.p50)),
+        event_p50_us: Some(us(event.p50)),
+        state_hash,
+    })
+}
+
 fn start(
-    options: &LatencyOptions<'_>,
+    start_peer: &dyn Fn(&[String]) -> std::io::Result<Child>,
     affinity: Option<&Affinity>,
     arguments: &[&str],
 ) -> Result<Peer, BenchError> {
     let arguments: Vec<String> = arguments.iter().map(|&a| a.to_owned()).collect();
-    unplaced(affinity, || (options.start_peer)(&arguments)).map(Peer).map_err(io("start the other process"))
+    unplaced(affinity, || start_peer(&arguments)).map(Peer).map_err(io("start the other process"))
 }
 
 fn floor(options: &LatencyOptions<'_>, affinity: Option<&Affinity>) -> Result<Percentiles, BenchError> {
     let path = std::path::PathBuf::from(format!("/dev/shm/cz_bench_{}", std::process::id()));
     let words = SharedWords::open(&path)?;
     let count = options.round_trips.to_string();
-    let result = start(options, affinity, &["word", &path.to_string_lossy(), &count]).and_then(|_peer| {
-        let mut histogram = new_histogram();
-        for i in 1..=options.round_trips {
-            let start = Instant::now();
-            words.round_trip(i)?;
-            let _ = histogram.record(start.elapsed().as_nanos() as u64);
-        }
-        Ok(Percentiles::of(&histogram))
-    });
+    let result =
+        start(options.start_peer, affinity, &["word", &path.to_string_lossy(), &count]).and_then(|_peer| {
+            let mut histogram = new_histogram();
+            for i in 1..=options.round_trips {
+                let start = Instant::now();
+                words.round_trip(i)?;
+                let _ = histogram.record(start.elapsed().as_nanos() as u64);
+            }
+            Ok(Percentiles::of(&histogram))
+        });
     let _ = std::fs::remove_file(path);
     result
 }
@@ -199,7 +222,7 @@ fn iceoryx2(
     let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits)?;
     let mut outbox = state.outbox(records.max(1))?;
     let count = options.round_trips.to_string();
-    let _peer = start(options, affinity, &["iceoryx2", &run.to_string(), &count])?;
+    let _peer = start(options.start_peer, affinity, &["iceoryx2", &run.to_string(), &count])?;
     let mut histogram = new_histogram();
     let record = VehicleState::default();
     let deadline = Instant::now() + PATIENCE;
@@ -249,7 +272,7 @@ fn socket_step(
             let listener = UnixListener::bind(&path).map_err(io("bind a unix socket"));
             rustix::process::umask(before);
             let listener = listener?;
-            let peer = start(options, affinity, &["unix", &path.to_string_lossy()]);
+            let peer = start(options.start_peer, affinity, &["unix", &path.to_string_lossy()]);
             let accepted = peer.and_then(|peer| {
                 let (stream, _) = listener.accept().map_err(io("accept"))?;
                 Ok((Stream::Unix(stream), peer))
@@ -260,7 +283,7 @@ fn socket_step(
         SocketKind::Tcp => {
             let listener = TcpListener::bind(("127.0.0.1", 0)).map_err(io("bind a TCP socket"))?;
             let port = listener.local_addr().map_err(io("read the port"))?.port();
-            let peer = start(options, affinity, &["tcp", &port.to_string()])?;
+            let peer = start(options.start_peer, affinity, &["tcp", &port.to_string()])?;
             let (stream, _) = listener.accept().map_err(io("accept"))?;
             stream.set_nodelay(true).map_err(io("configure the socket"))?;
             (Stream::Tcp(stream), peer)
@@ -276,8 +299,11 @@ fn socket_step(
 }
 
 /// World and coordinator here, the controller in another process, frames over iceoryx2.
-fn iceoryx2_step(options: &LatencyOptions<'_>, affinity: Option<&Affinity>) -> Result<Stepped, BenchError> {
-    let scenario = &options.scenario;
+fn iceoryx2_step(
+    scenario: &Arc<Scenario>,
+    start_peer: &dyn Fn(&[String]) -> std::io::Result<Child>,
+    affinity: Option<&Affinity>,
+) -> Result<Stepped, BenchError> {
     let run = own_run("step");
     let space = RunSpace::enter(&run)?;
     let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
@@ -287,7 +313,7 @@ fn iceoryx2_step(options: &LatencyOptions<'_>, affinity: Option<&Affinity>) -> R
     let coordination = space.create::<Assignment>(frames::SERVICE_COORDINATION, limits)?;
     let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits)?;
     let (state, coordination) = (state.outbox(expected)?, coordination.outbox(2 * expected)?);
-    let _peer = start(options, affinity, &["step", &run.to_string()])?;
+    let _peer = start(start_peer, affinity, &["step", &run.to_string()])?;
     // An empty frame says that the other process has opened its ends.
     drop(receive(&mut commands)?);
     lead(scenario, state, coordination, commands)

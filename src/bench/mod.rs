@@ -11,14 +11,16 @@ mod socket;
 mod solver;
 mod step;
 mod sumo;
+mod waiting;
 
 pub use corridors::corridors;
-pub use latency::{LatencyOptions, LatencyReport, latency};
+pub use latency::{LatencyOptions, LatencyReport, latency, two_processes};
 pub use machine::Machine;
-pub use peer::{PeerKind, run_peer};
+pub use peer::{PeerKind, keep_busy, run_peer};
 pub use scale::{ScaleOptions, ScaleReport, scale};
 pub use solver::{SolverReport, solver};
 pub use sumo::{Sumo, SumoSide};
+pub use waiting::{NINE, Side, THREE, Timed, WaitingOptions, WaitingPoint, WaitingReport, waiting};
 
 use crate::lockstep::LockstepError;
 use crate::process::ProcessError;

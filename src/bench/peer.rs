@@ -73,6 +73,15 @@ pub fn run_peer(kind: &PeerKind, scenario: &Arc<Scenario>) -> Result<(), BenchEr
     }
 }
 
+/// Keeps a core busy for as long as the process that started this one lives.
+pub fn keep_busy() {
+    let parent = rustix::process::getppid();
+    let mut sum = 0_u64;
+    while rustix::process::getppid() == parent {
+        sum = (0..10_000_000).fold(sum, |sum, i| black_box(sum ^ i));
+    }
+}
+
 fn echo_frames(run: &RunName, count: u64) -> Result<(), BenchError> {
     let space = RunSpace::enter(run)?;
     let deadline = Instant::now() + PATIENCE;

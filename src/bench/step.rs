@@ -18,6 +18,10 @@ use std::time::Instant;
 
 /// What a run of steps has come to.
 pub(super) struct Stepped {
+    /// Wall time of all steps, s.
+    pub wall_s: f64,
+    /// All steps, without a warm-up.
+    pub all: Percentiles,
     /// Steps without coordination.
     pub steady: Percentiles,
     /// Steps in which the coordinator acts.
@@ -62,8 +66,9 @@ where
         coordination: None::<MemoryInbox<Assignment>>,
     };
     let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, RUN_ID, 1);
-    let (mut steady, mut event) = (new_histogram(), new_histogram());
+    let (mut all, mut steady, mut event) = (new_histogram(), new_histogram(), new_histogram());
     let mut steps = 0;
+    let begun = Instant::now();
     loop {
         let start = Instant::now();
         if world.advance()? == Progress::Finished {
@@ -75,12 +80,16 @@ where
             break;
         }
         steps += 1;
+        let ns = start.elapsed().as_nanos() as u64;
+        let _ = all.record(ns);
         if steps > WARM_UP_STEPS {
             let histogram = if world.was_event() { &mut event } else { &mut steady };
-            let _ = histogram.record(start.elapsed().as_nanos() as u64);
+            let _ = histogram.record(ns);
         }
     }
     Ok(Stepped {
+        wall_s: begun.elapsed().as_secs_f64(),
+        all: Percentiles::of(&all),
         steady: Percentiles::of(&steady),
         event: Percentiles::of(&event),
         state_hash: world.world().state_hash(),

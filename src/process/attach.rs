@@ -8,7 +8,7 @@ use crate::encoding;
 use crate::lockstep::{Handover, Seat};
 use crate::scenario::{Drivers, Scenario, decode, scenario_hash};
 use crate::transport::TransportError;
-use crate::transport::iox::{AttachDesk, AttachLine, RunName, RunSpace, SpaceError};
+use crate::transport::iox::{AttachDesk, AttachLine, Bells, RunName, RunSpace, SpaceError};
 use ipc_schemas::{self as frames, AttachReply, AttachRequest, Role, schema_hash};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -38,6 +38,8 @@ pub struct Attachment {
     pub reply: AttachReply,
     /// The scenario of the run.
     pub scenario: Arc<Scenario>,
+    /// The bells of the run.
+    pub bells: Bells,
     line: AttachLine,
     request: AttachRequest,
     run: RunName,
@@ -84,7 +86,8 @@ impl Attachment {
             return Err(ProcessError::Refused { run: run.to_string(), role: joining.role, reason });
         }
         let scenario = Arc::new(decode(&bytes)?);
-        Ok(Attachment { reply, scenario, line, request, run: run.clone(), joining })
+        let bells = space.bells()?;
+        Ok(Attachment { reply, scenario, bells, line, request, run: run.clone(), joining })
     }
 
     /// Tells the world that all ends of the services are open. After this the run may begin; if it has

@@ -87,7 +87,7 @@ impl House {
                 return Err(ProcessError::Faulty { who, fault: fault.clone() });
             }
         }
-        match (waiter.wait(awaited), self.gone) {
+        match (waiter.wait(awaited, self.pacer.time_left()), self.gone) {
             (Err(ProcessError::PeerGone { peer, .. }), _) if self.may_be_replaced(peer) => {
                 self.gone = Some(peer);
                 let others = self.reception.peers().0.into_iter().filter(|p| *p != peer);

@@ -16,6 +16,7 @@ pub mod seating;
 mod services;
 mod stop;
 mod wait;
+mod wait_policy;
 mod world;
 
 pub use attach::{Attachment, Joining};

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use std::time::{Duration, Instant};
 
 /// When steps begin.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum Pace {
     /// Each as soon as the one before is done.
     #[default]
@@ -19,7 +19,7 @@ pub enum Pace {
 }
 
 /// What the world does about a controller that has not answered by the deadline.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum OnMiss {
     /// It waits, and makes up for lost time afterwards.
@@ -159,6 +159,11 @@ impl Pacer {
             self.missed_steps += 1;
             self.backlog += 1;
         }
+    }
+
+    /// Time until the present step's deadline, where it has one that has not passed.
+    pub fn time_left(&self) -> Option<Duration> {
+        self.deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()))
     }
 
     /// Whether the present step's deadline has just passed; true once per step.

@@ -1,6 +1,6 @@
 //! The coordinator and controller processes.
 
-use super::services::{controller_ropes, coordinator_rope, expected_vehicles};
+use super::services::{controller_ropes, expected_vehicles, rope_of};
 use super::wait::Participant;
 use super::{Attachment, Joining, Patience, ProcessError, Settling, StopFlag, WaitMode, Waiter};
 use crate::control::ControllerPool;
@@ -37,7 +37,8 @@ pub fn run_coordinator(
     let mask = neighbour_coordinators(&scenario.network, coordinators)[index as usize];
     let own = |prefix: &str| format!("{prefix}{index}");
     let wait = WaitMode::from_code(attachment.reply.waiting);
-    let bell = wait.has_bell(Role::Coordinator).then(|| space.bell(&own(frames::BELL_COORDINATOR_PREFIX)));
+    let bells = &attachment.bells;
+    let bell = wait.has_bell(Role::Coordinator).then(|| bells.bell(Role::Coordinator, index));
     let held = settling.settle(Role::Coordinator, index, wait, wait.hot_processes(coordinators, controllers));
     let neighbours = (0..coordinators)
         .filter(|n| mask >> n & 1 == 1)
@@ -45,7 +46,8 @@ pub fn run_coordinator(
             let service = space.open(&format!("{}{n}", frames::SERVICE_SUMMARY_PREFIX))?;
             let owned = zones_of(zones, n, coordinators);
             let expected = owned.len();
-            Ok((n as u16, owned, service.outbox(expected)?.ringing(coordinator_rope(&space, wait, n))))
+            let rope = rope_of(bells, wait, Role::Coordinator, n);
+            Ok((n as u16, owned, service.outbox(expected)?.ringing(rope)))
         })
         .collect::<Result<_, ProcessError>>()?;
     let ports = CoordinatorPorts {
@@ -56,7 +58,7 @@ pub fn run_coordinator(
         coordination: space
             .open(frames::SERVICE_COORDINATION)?
             .outbox(2 * expected_vehicles(scenario))?
-            .ringing(controller_ropes(&space, wait, controllers)),
+            .ringing(controller_ropes(bells, wait, controllers)),
     };
     let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
     let identity = identity(&attachment.reply, Role::Coordinator);
@@ -68,7 +70,7 @@ pub fn run_coordinator(
     // Declared last, so let go first.
     let _held = held;
     let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
-    let mut waiter = Waiter::new(patience, bell.flatten(), stop.clone(), attachment.world());
+    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world());
     let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
     driver.refused().into_iter().for_each(refused);
     end
@@ -88,21 +90,22 @@ pub fn run_controller(
     let attachment = Attachment::join(&space, run, joining, stop)?;
     let AttachReply { index, coordinators, controllers, first_step, .. } = attachment.reply;
     let wait = WaitMode::from_code(attachment.reply.waiting);
-    let own_bell = || space.bell(&format!("{}{index}", frames::BELL_CONTROLLER_PREFIX));
-    let bell = wait.has_bell(Role::Controller).then(own_bell).flatten();
+    let bells = &attachment.bells;
+    let bell = wait.has_bell(Role::Controller).then(|| bells.bell(Role::Controller, index));
     let held = settling.settle(Role::Controller, index, wait, wait.hot_processes(coordinators, controllers));
     let scenario = &attachment.scenario;
     // Plug-ins come behind the processes of the pool.
     let pool = controllers - scenario.plugins.len() as u32;
     let zones = scenario.network.zones.len() as u32;
-    let ports = ControllerPorts {
-        state: space.open(frames::SERVICE_STATE)?.inbox()?,
-        coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
-        command: space
-            .open(frames::SERVICE_COMMAND)?
-            .outbox(expected_vehicles(scenario))?
-            .ringing(wait.has_bell(Role::World).then(|| space.bell_rope(frames::BELL_WORLD)).flatten()),
-    };
+    let ports =
+        ControllerPorts {
+            state: space.open(frames::SERVICE_STATE)?.inbox()?,
+            coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
+            command: space
+                .open(frames::SERVICE_COMMAND)?
+                .outbox(expected_vehicles(scenario))?
+                .ringing(rope_of(bells, wait, Role::World, 0)),
+        };
     let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
     let identity = identity(&attachment.reply, Role::Controller);
     let mut driver = ControllerDriver::new(role, ports, identity, first_step);

@@ -5,7 +5,7 @@ use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
 use std::sync::OnceLock;
 
 /// Where processes go.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum Placement {
     /// Wherever the system puts them.
     #[default]
@@ -36,6 +36,11 @@ impl Affinity {
     pub fn current() -> Option<Affinity> {
         sched_getaffinity(None).ok().map(Affinity)
     }
+
+    /// Gives them back to the calling thread.
+    pub fn restore(&self) {
+        let _ = sched_setaffinity(None, &self.0);
+    }
 }
 
 /// Pins the calling thread, and what it starts from then on, by its role; returns its core, or `None` when it
@@ -65,6 +70,23 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
 pub(super) fn number_of_cores() -> usize {
     static CORES: OnceLock<usize> = OnceLock::new();
     *CORES.get_or_init(|| std::thread::available_parallelism().map_or(1, usize::from))
+}
+
+/// Number of cores of the machine, whoever may use them.
+pub(super) fn cores_online() -> usize {
+    static CORES: OnceLock<usize> = OnceLock::new();
+    // "0-3,8": ranges and single cores.
+    let count = |list: String| {
+        let bounds = |range: &str| -> Option<usize> {
+            let (first, last) = range.split_once('-').unwrap_or((range, range));
+            Some(last.parse::<usize>().ok()? + 1 - first.parse::<usize>().ok()?)
+        };
+        list.trim().split(',').map(bounds).sum::<Option<usize>>()
+    };
+    *CORES.get_or_init(|| {
+        let list = std::fs::read_to_string("/sys/devices/system/cpu/online").ok();
+        list.and_then(count).unwrap_or_else(number_of_cores)
+    })
 }
 
 /// The cores the calling thread may use.

@@ -72,7 +72,8 @@ impl Settling<'_> {
             (memory_locked, memory_note) = lock_memory();
         }
         let refusal = if self.realtime { ask_for_fifo(role, wait, hot_processes).err() } else { None };
-        let is_with_controllers = self.pin == Placement::Auto && wait == WaitMode::Hybrid;
+        let yields = matches!(wait, WaitMode::Adaptive | WaitMode::Hybrid);
+        let is_with_controllers = self.pin == Placement::Auto && yields;
         if !self.realtime && role == Role::Coordinator && is_with_controllers {
             // A controller that waits for it yields. So its waking need not interrupt the core, which takes longer
             // than the next yield is away. On any other core it would wait for whoever is there.

@@ -1,11 +1,11 @@
-//! The services and bells of a run, as its world creates them.
+//! The services of a run, as its world creates them, and whose bells are rung with them.
 
 use super::WaitMode;
 use crate::lockstep::{WorldDriver, WorldPorts};
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
 use crate::transport::iox::{
-    BellRope, BellService, IoxInbox, IoxOutbox, RunSpace, Service, ServiceLimits, SpaceError,
+    BellRope, Bells, IoxInbox, IoxOutbox, RunSpace, Service, ServiceLimits, SpaceError,
 };
 use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
 
@@ -76,18 +76,18 @@ impl Services {
 
     pub(super) fn world_ports(
         &self,
-        space: &RunSpace,
+        bells: &Bells,
         scenario: &Scenario,
         wait: WaitMode,
     ) -> Result<Ports, SpaceError> {
         let expected = expected_vehicles(scenario);
         Ok(WorldPorts {
-            state: self.state.outbox(expected)?.ringing(controller_ropes(space, wait, self.controllers)),
+            state: self.state.outbox(expected)?.ringing(controller_ropes(bells, wait, self.controllers)),
             coordinator_states: self
                 .coordinator_states
                 .iter()
                 .zip(0..)
-                .map(|(s, i)| Ok(s.outbox(expected)?.ringing(coordinator_rope(space, wait, i))))
+                .map(|(s, i)| Ok(s.outbox(expected)?.ringing(rope_of(bells, wait, Role::Coordinator, i))))
                 .collect::<Result<_, SpaceError>>()?,
             command: self.command.inbox()?,
             coordination: if self.keeps { Some(self.coordination.inbox()?) } else { None },
@@ -95,41 +95,15 @@ impl Services {
     }
 }
 
-/// Creates the bells of all who sleep under this mode.
-pub(super) fn create_bells(
-    space: &RunSpace,
-    wait: WaitMode,
-    coordinators: u32,
-    controllers: u32,
-) -> Result<Vec<BellService>, SpaceError> {
-    let (m, n) = (coordinators as usize, controllers as usize);
-    let mut bells = Vec::new();
-    if wait.has_bell(Role::World) {
-        bells.push(space.create_bell(frames::BELL_WORLD, n)?);
-    }
-    if wait.has_bell(Role::Coordinator) {
-        for i in 0..coordinators {
-            bells.push(space.create_bell(&format!("{}{i}", frames::BELL_COORDINATOR_PREFIX), m)?);
-        }
-    }
-    if wait.has_bell(Role::Controller) {
-        for i in 0..controllers {
-            bells.push(space.create_bell(&format!("{}{i}", frames::BELL_CONTROLLER_PREFIX), 1 + m)?);
-        }
-    }
-    Ok(bells)
-}
-
-/// The ropes of all controllers' bells, when they have any.
-pub(super) fn controller_ropes(space: &RunSpace, wait: WaitMode, controllers: u32) -> Vec<BellRope> {
+/// The ropes of all controllers' bells, when they sleep under this mode.
+pub(super) fn controller_ropes(bells: &Bells, wait: WaitMode, controllers: u32) -> Vec<BellRope> {
     let count = if wait.has_bell(Role::Controller) { controllers } else { 0 };
-    (0..count).filter_map(|i| space.bell_rope(&format!("{}{i}", frames::BELL_CONTROLLER_PREFIX))).collect()
+    (0..count).map(|i| bells.rope(Role::Controller, i)).collect()
 }
 
-/// The rope of a coordinator's bell, when it has one.
-pub(super) fn coordinator_rope(space: &RunSpace, wait: WaitMode, index: u32) -> Option<BellRope> {
-    let rope = || space.bell_rope(&format!("{}{index}", frames::BELL_COORDINATOR_PREFIX));
-    wait.has_bell(Role::Coordinator).then(rope).flatten()
+/// The rope of one process's bell, when those of its role sleep under this mode.
+pub(super) fn rope_of(bells: &Bells, wait: WaitMode, role: Role, index: u32) -> Option<BellRope> {
+    wait.has_bell(role).then(|| bells.rope(role, index))
 }
 
 /// About as many vehicles as the network holds in dense but moving traffic. Frames may be longer; this

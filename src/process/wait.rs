@@ -1,19 +1,23 @@
 //! How a process waits for a frame: busily at first, then asleep, never for ever.
 
-use super::placement::number_of_cores;
-use super::realtime::Breather;
+use super::placement::{cores_online, number_of_cores};
+use super::realtime::{Breather, is_fifo};
+use super::wait_policy::{Advice, Situation, WaitPolicy};
 use super::{Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
 use crate::scenario::ControllerNames;
-use crate::transport::iox::Bell;
-use ipc_schemas::{Role, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
+use crate::transport::iox::{Bell, monotonic_ns};
+use ipc_schemas::{Role, WAITING_ADAPTIVE, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
+use std::io::Read;
 use std::time::{Duration, Instant};
 
 /// How the processes of a run wait for each other's frames.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, clap::ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
 pub enum WaitMode {
-    /// World and controllers spin, then yield; coordinators sleep from event to event.
+    /// World and controllers spin while that pays and sleep otherwise; coordinators sleep from event to event.
     #[default]
+    Adaptive,
+    /// World and controllers spin, then yield; coordinators sleep from event to event.
     Hybrid,
     /// Everyone spins; needs a core for each process.
     Spin,
@@ -25,6 +29,7 @@ impl WaitMode {
     /// The code in attach replies.
     pub fn code(self) -> u32 {
         match self {
+            WaitMode::Adaptive => WAITING_ADAPTIVE,
             WaitMode::Hybrid => WAITING_HYBRID,
             WaitMode::Spin => WAITING_SPIN,
             WaitMode::Block => WAITING_BLOCK,
@@ -34,18 +39,19 @@ impl WaitMode {
     /// The mode a reply names; an unknown code is the default, which always works.
     pub fn from_code(code: u32) -> WaitMode {
         match code {
+            WAITING_HYBRID => WaitMode::Hybrid,
             WAITING_SPIN => WaitMode::Spin,
             WAITING_BLOCK => WaitMode::Block,
-            _ => WaitMode::Hybrid,
+            _ => WaitMode::Adaptive,
         }
     }
 
-    /// Whether receivers of this role sleep on a bell, so that senders must ring.
+    /// Whether receivers of this role may sleep on a bell, so that senders must ring.
     pub fn has_bell(self, receiver: Role) -> bool {
         match self {
             WaitMode::Hybrid => receiver == Role::Coordinator,
             WaitMode::Spin => false,
-            WaitMode::Block => true,
+            WaitMode::Adaptive | WaitMode::Block => true,
         }
     }
 
@@ -55,17 +61,26 @@ impl WaitMode {
     }
 }
 
-/// How long a process spins, yields and sleeps for one frame.
-#[derive(Clone, Copy, Debug)]
+/// How a process waits for a frame, and how long at most.
+#[derive(Debug)]
 pub struct Patience {
-    /// Time spent spinning.
-    spin: Duration,
-    /// Time after which yielding ends too and sleeping begins.
-    busy: Duration,
-    /// Longest sleep between two polls.
-    nap: Duration,
+    manner: Manner,
     /// A frame that takes longer ends the run.
     timeout: Duration,
+}
+
+/// When a process spins, yields and sleeps.
+#[derive(Debug)]
+enum Manner {
+    /// For times laid down.
+    Fixed {
+        /// Time spent spinning.
+        spin: Duration,
+        /// Time after which yielding ends too and sleeping begins.
+        busy: Duration,
+    },
+    /// As experience tells.
+    Learned(WaitPolicy),
 }
 
 /// Frames are sure to come within this time while all is well; beyond it, spinning is a waste.
@@ -75,29 +90,53 @@ const BUSY: Duration = Duration::from_millis(2);
 /// Sleep between polls without a bell.
 const NAP: Duration = Duration::from_micros(50);
 /// Sleep on a bell: the ring ends it; this only bounds how late signals and dead peers are noticed.
-const BELL_NAP: Duration = Duration::from_millis(20);
+const BELL_NAP: Duration = Duration::from_millis(10);
 
 impl Patience {
     /// What suits a role under a mode in a run with that many hot processes (world and controllers).
     pub fn of(mode: WaitMode, role: Role, hot_processes: usize, timeout: Duration) -> Patience {
-        let cores = number_of_cores();
-        let sleeper = Patience { spin: Duration::ZERO, busy: Duration::ZERO, nap: BELL_NAP, timeout };
-        match mode {
-            WaitMode::Block => sleeper,
-            WaitMode::Hybrid if role == Role::Coordinator => sleeper,
+        let shares_cores = hot_processes > number_of_cores();
+        // Under SCHED_FIFO a yield lets nobody run who does not have it too: sleeping does.
+        let may_yield = !is_fifo();
+        let busy = if may_yield { BUSY } else { SPIN };
+        let manner = match mode {
+            WaitMode::Block => Manner::ASLEEP,
+            WaitMode::Adaptive | WaitMode::Hybrid if role == Role::Coordinator => Manner::ASLEEP,
+            WaitMode::Adaptive => Manner::Learned(WaitPolicy::new(Situation { shares_cores, may_yield })),
             // More spinners than cores would only keep each other from working.
-            WaitMode::Hybrid if hot_processes > cores => {
-                Patience { spin: Duration::ZERO, busy: BUSY, nap: NAP, timeout }
-            }
-            WaitMode::Hybrid => Patience { spin: SPIN, busy: BUSY, nap: NAP, timeout },
-            WaitMode::Spin => Patience { spin: Duration::MAX, busy: Duration::MAX, nap: NAP, timeout },
+            WaitMode::Hybrid if shares_cores => Manner::Fixed { spin: Duration::ZERO, busy },
+            WaitMode::Hybrid => Manner::Fixed { spin: SPIN, busy },
+            WaitMode::Spin => Manner::Fixed { spin: Duration::MAX, busy: Duration::MAX },
+        };
+        Patience { manner, timeout }
+    }
+}
+
+impl Manner {
+    const ASLEEP: Manner = Manner::Fixed { spin: Duration::ZERO, busy: Duration::ZERO };
+
+    /// Whether a wait begins with spinning, so that the first look can wait too.
+    fn begins_spinning(&self, gives_way: bool) -> bool {
+        match self {
+            Manner::Fixed { spin, busy } => !(spin.is_zero() || gives_way && spin < busy),
+            Manner::Learned(policy) => policy.begins_spinning(gives_way),
         }
     }
 
-    /// Whether spinning is followed by yielding: neither where it never ends nor under SCHED_FIFO.
-    fn yields(&self) -> bool {
-        self.spin < self.busy
+    /// Whether the time each yield takes says something.
+    fn times_yields(&self) -> bool {
+        matches!(self, Manner::Learned(_))
     }
+}
+
+/// Whether more processes want to run than the machine has cores; not where the system does not tell.
+fn more_run_than_cores() -> bool {
+    // See proc(5): the fourth field is those that run or wait to run, a slash, and all there are.
+    let mut text = [0; 64];
+    let length = std::fs::File::open("/proc/loadavg").and_then(|mut file| file.read(&mut text)).unwrap_or(0);
+    let load = std::str::from_utf8(&text[..length]).unwrap_or_default();
+    let runnable = load.split_whitespace().nth(3).and_then(|field| field.split('/').next()?.parse().ok());
+    runnable.is_some_and(|runnable: usize| runnable > cores_online())
 }
 
 /// A driver of a participant.
@@ -113,11 +152,15 @@ pub trait Participant {
 pub struct Waiter {
     patience: Patience,
     bell: Option<Bell>,
+    /// What to do until the next look; nothing is known yet at the beginning of a wait.
+    advice: Option<Advice>,
+    /// The bell has been told that this process is about to sleep.
+    lies_down: bool,
     stop: StopFlag,
     peers: Peers,
     names: ControllerNames,
-    polls: u32,
-    since: Option<Instant>,
+    polls: u64,
+    since: Option<u64>,
     waited: Duration,
     peers_checked: Duration,
     /// There is one when the process would keep others from running.
@@ -125,7 +168,7 @@ pub struct Waiter {
 }
 
 /// How often the clock is read while polling busily: reading it costs about as much as a poll.
-const POLLS_PER_LOOK: u32 = 64;
+const POLLS_PER_LOOK: u64 = 32;
 /// How long a peer that has left the services may take to end.
 const LEAVING: Duration = Duration::from_millis(200);
 /// How often the peers are checked during a long wait.
@@ -134,15 +177,11 @@ const PEER_CHECK: Duration = Duration::from_millis(10);
 impl Waiter {
     /// A waiter that gives up when asked to stop, when a peer has died, or when patience runs out.
     pub fn new(patience: Patience, bell: Option<Bell>, stop: StopFlag, peers: Peers) -> Waiter {
-        // Without a bell nobody ends a long sleep.
-        let nap = if bell.is_some() { patience.nap } else { patience.nap.min(NAP) };
-        let breather = Breather::if_needed();
-        // Under SCHED_FIFO a yield lets nobody run who does not have it too: sleeping does.
-        let busy = if breather.is_some() { patience.spin } else { patience.busy };
         Waiter {
-            patience: Patience { nap, busy, ..patience },
-            breather,
+            patience,
             bell,
+            advice: None,
+            lies_down: false,
             stop,
             peers,
             names: ControllerNames::default(),
@@ -150,6 +189,7 @@ impl Waiter {
             since: None,
             waited: Duration::ZERO,
             peers_checked: Duration::ZERO,
+            breather: Breather::if_needed(),
         }
     }
 
@@ -158,42 +198,89 @@ impl Waiter {
         if let Some(breather) = &mut self.breather {
             breather.breathe();
         }
-        self.polls = 0;
-        self.since = None;
+        if std::mem::take(&mut self.polls) == 0 {
+            return;
+        }
+        self.advice = None;
+        if let Manner::Learned(policy) = &mut self.patience.manner {
+            policy.came(monotonic_ns);
+        }
+        if self.since.take().is_none() {
+            // Nobody has so much as looked at the clock.
+            return;
+        }
+        if std::mem::take(&mut self.lies_down)
+            && let Some(bell) = &self.bell
+        {
+            bell.stay_awake();
+        }
         self.waited = Duration::ZERO;
         self.peers_checked = Duration::ZERO;
     }
 
-    /// Nothing came: waits a little, or says why waiting is over.
-    pub fn wait(&mut self, awaited: Awaited) -> Result<(), ProcessError> {
-        self.polls = self.polls.wrapping_add(1);
-        let busy = self.waited < self.patience.busy;
-        if !busy || self.polls.is_multiple_of(POLLS_PER_LOOK) {
-            self.look(awaited)?;
-        }
+    /// Nothing came: waits a little, `at_most` so long, or says why waiting is over.
+    pub fn wait(&mut self, awaited: Awaited, at_most: Option<Duration>) -> Result<(), ProcessError> {
+        self.polls += 1;
         // A coordinator has just been woken, likely on this core: spinning would only keep it from it.
-        let give_way = awaited.role == Role::Coordinator && self.patience.yields();
-        if self.waited < self.patience.spin && !give_way {
-            std::hint::spin_loop();
-        } else if busy {
-            std::thread::yield_now();
-        } else if let Some(bell) = &self.bell {
-            bell.sleep(self.patience.nap);
-        } else {
-            std::thread::sleep(self.patience.nap);
+        let gives_way = awaited.role == Role::Coordinator;
+        let is_time = match self.advice {
+            None => !self.patience.manner.begins_spinning(gives_way),
+            Some(Advice::Spin) => false,
+            Some(Advice::Yield) => self.patience.manner.times_yields(),
+            Some(Advice::Sleep) => true,
+        };
+        if is_time || self.polls.is_multiple_of(POLLS_PER_LOOK) {
+            let now = self.look(awaited)?;
+            let waited = self.waited;
+            self.advice = Some(match &mut self.patience.manner {
+                Manner::Fixed { spin, busy } => {
+                    let gives_way = gives_way && *spin < *busy;
+                    match waited {
+                        waited if waited < *spin && !gives_way => Advice::Spin,
+                        waited if waited < *busy => Advice::Yield,
+                        _ => Advice::Sleep,
+                    }
+                }
+                Manner::Learned(policy) => policy.look(now, gives_way, more_run_than_cores),
+            });
+        }
+        match self.advice {
+            None | Some(Advice::Spin) => std::hint::spin_loop(),
+            Some(Advice::Yield) => std::thread::yield_now(),
+            Some(Advice::Sleep) => self.sleep(at_most),
         }
         Ok(())
     }
 
-    /// Looks at the signals, the clock and the peers.
-    fn look(&mut self, awaited: Awaited) -> Result<(), ProcessError> {
+    fn sleep(&mut self, at_most: Option<Duration>) {
+        let bound = |nap: Duration| at_most.map_or(nap, |at_most| nap.min(at_most));
+        let Some(bell) = &self.bell else {
+            // Nobody ends a long sleep.
+            std::thread::sleep(bound(NAP));
+            return;
+        };
+        if !self.lies_down {
+            // What came before it did has been looked for in vain once more when this is called again.
+            self.lies_down = true;
+            bell.lie_down();
+            return;
+        }
+        self.lies_down = false;
+        let rung_at = bell.sleep(bound(BELL_NAP));
+        if let Manner::Learned(policy) = &mut self.patience.manner {
+            policy.slept(monotonic_ns(), rung_at);
+        }
+    }
+    /// Looks at the signals, the clock and the peers; returns what the clock says, ns.
+    fn look(&mut self, awaited: Awaited) -> Result<u64, ProcessError> {
         if self.stop.is_set() {
             return Err(ProcessError::Interrupted { step: Some(awaited.step) });
         }
         if let Some(breather) = &mut self.breather {
             breather.breathe();
         }
-        self.waited = self.since.get_or_insert_with(Instant::now).elapsed();
+        let now = monotonic_ns();
+        self.waited = Duration::from_nanos(now - *self.since.get_or_insert(now));
         if self.waited >= self.patience.timeout {
             let awaited = awaited.named(&self.names);
             return Err(ProcessError::Timeout { awaited, seconds: self.patience.timeout.as_secs_f64() });
@@ -206,7 +293,7 @@ impl Waiter {
                 return Err(ProcessError::PeerGone { peer, name, consequence });
             }
         }
-        Ok(())
+        Ok(now)
     }
 
     /// What to call controllers from now on.
@@ -234,7 +321,7 @@ impl Waiter {
             match driver.advance().map_err(|error| self.explain(error))? {
                 Progress::Finished => return Ok(()),
                 Progress::Advanced => self.reset(),
-                Progress::Waiting(awaited) => self.wait(awaited)?,
+                Progress::Waiting(awaited) => self.wait(awaited, None)?,
                 Progress::Behind => {
                     if let Some(handover) = catch_up()? {
                         driver.take_over(handover);

@@ -6,7 +6,7 @@ use super::observe::{self, ObservedSteps};
 use super::outcome::{History, Outcome, StepMeter};
 use super::pace::Pacer;
 use super::placement::number_of_cores;
-use super::services::{Services, create_bells, expected_vehicles};
+use super::services::{Services, expected_vehicles};
 use super::{Pace, Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Handover, Ledger, Progress, Seat, WorldDriver};
@@ -15,7 +15,7 @@ use crate::scenario::Scenario;
 use crate::step::StepFrames;
 use crate::transport::iox::{RunName, RunSpace, SpaceError};
 use crate::world::World;
-use ipc_schemas::{self as frames, Role};
+use ipc_schemas::Role;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -126,10 +126,10 @@ pub fn run_world(
         }
         false => None,
     };
-    let _bells = create_bells(&space, wait, coordinators, controllers)?;
+    let bells = space.create_bells()?;
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
-    let bell = rung.then(|| space.bell(frames::BELL_WORLD)).flatten();
+    let bell = rung.then(|| bells.bell(Role::World, 0));
     let mut reception =
         Reception::open(&space, scenario, run_id, (coordinators, controllers), wait).map_err(active)?;
     reception.first_step = first_step;
@@ -138,8 +138,7 @@ pub fn run_world(
         Some(Handover { step: first_step, ..ledger.handover(role, index) })
     };
     receive_all(&mut reception, &handed, observed.as_ref(), options, stop)?;
-    // Bells are hung up by now, so that the ropes hold.
-    let ports = services.world_ports(&space, scenario, wait)?;
+    let ports = services.world_ports(&bells, scenario, wait)?;
 
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
     driver.keep(ledger);

@@ -19,6 +19,8 @@ pub(in crate::app) enum BenchKind {
     Solver(MeasureArgs),
     /// Step time from a hundred to a hundred thousand vehicles.
     Scale(ScaleArgs),
+    /// The ways of waiting beside each other, on a quiet machine and on a busy one, and what `cz run` does at first.
+    Wait(WaitBenchArgs),
     /// The other process of a measurement.
     #[command(hide = true)]
     Peer(PeerArgs),
@@ -46,6 +48,21 @@ pub(in crate::app) struct ScaleArgs {
     /// far more than ten.
     #[arg(long, value_name = "VEHICLES", default_value_t = 10_000, requires = "with_sumo")]
     pub sumo_up_to: usize,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct WaitBenchArgs {
+    #[command(flatten)]
+    pub measure: MeasureArgs,
+    /// Numbers of busy processes beside the runs.
+    #[arg(long, value_name = "N,...", value_delimiter = ',', default_values_t = [0, 2, 4, 8])]
+    pub busy: Vec<usize>,
+    /// Runs of each way of waiting under each load, by turns.
+    #[arg(long, value_name = "N", default_value_t = 9)]
+    pub repetitions: usize,
+    /// The program `cz` of another build, measured beside this one's ways of waiting with its default.
+    #[arg(long, value_name = "FILE")]
+    pub beside: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]

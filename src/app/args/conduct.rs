@@ -137,7 +137,7 @@ pub(in crate::app) struct ConductArgs {
     #[command(flatten)]
     pub wait: WaitArgs,
     /// How the processes of the run wait for frames.
-    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Hybrid)]
+    #[arg(long = "wait", value_enum, default_value_t = WaitMode::Adaptive)]
     pub wait_mode: WaitMode,
     /// What becomes of the run when a coordinator or a process of the built-in pool dies.
     #[arg(long, value_enum, default_value_t = Restart::OnFailure)]

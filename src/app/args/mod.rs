@@ -1,13 +1,14 @@
 //! Command-line arguments.
 
 mod bench;
+mod choices;
 mod conduct;
 mod record;
 mod run;
 mod scenario;
 
 use crate::reproduce::cli::ReproduceArgs;
-pub(super) use bench::{BenchArgs, BenchKind, PeerArgs};
+pub(super) use bench::{BenchArgs, BenchKind, PeerArgs, WaitBenchArgs};
 use clap::{Args, Parser, Subcommand};
 pub(super) use conduct::{ConductArgs, Restart, ShareArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
@@ -50,7 +51,7 @@ pub(super) enum Command {
     Branch(BranchArgs),
     /// Regenerate the paper's tables and figures with intervals, verdicts and errata.
     Reproduce(ReproduceArgs),
-    /// Measure latency, the solver, or scale on this machine.
+    /// Measure latency, the solver, scale, or waiting on this machine.
     Bench(BenchArgs),
     /// Remove the shared memory and files that crashed runs of yours have left; active runs are not touched.
     Clean(CleanArgs),

@@ -7,7 +7,7 @@ mod place;
 mod ports;
 mod space;
 
-pub use bell::{Bell, BellRope, BellService};
+pub use bell::{Bell, BellRope, Bells, monotonic_ns};
 pub use blocks::{Block, BlockInbox, BlockOutbox};
 pub use leftovers::{Condition, Leftover, clean, sweep_dead_runs};
 pub use ports::{IoxFrame, IoxInbox, IoxLoan, IoxOutbox};

@@ -1,6 +1,6 @@
 //! The boxes over iceoryx2 ports.
 
-use super::bell::BellRope;
+use super::bell::{BellRope, ring_all};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
@@ -84,7 +84,7 @@ impl<R: Record> Loan<R> for IoxLoan<'_, R> {
             service: service.to_owned(),
             reason: format!("{error:?}"),
         })?;
-        self.bells.iter().for_each(BellRope::ring);
+        ring_all(self.bells);
         Ok(reached)
     }
 }

@@ -3,8 +3,9 @@
 //! A run has a directory of its own and a file-name prefix of its own (`place`). Whoever leaves last removes
 //! both, including the one global file iceoryx2 leaves behind.
 
+use super::bell::BellRope;
 use super::leftovers::sweep_dead_runs;
-use super::place::{Base, Found, Place, Presence, shared_memory};
+use super::place::{Base, Found, Place, Presence, SHARED_MEMORY, shared_memory};
 use super::ports::{Factory, IoxInbox, IoxOutbox};
 use crate::transport::TransportError;
 use iceoryx2::config::Config;
@@ -18,8 +19,10 @@ use iceoryx2::prelude::{
 use iceoryx2::sample::Sample;
 use iceoryx2::service::builder::publish_subscribe::{PublishSubscribeCreateError, PublishSubscribeOpenError};
 use iceoryx2::service::ipc;
-use ipc_schemas::{AttachReply, AttachRequest, FrameHeader, Record, SERVICE_ATTACH, SERVICE_ATTACH_REPLY};
-use std::path::PathBuf;
+use ipc_schemas::{
+    AttachReply, AttachRequest, FrameHeader, Record, Role, SERVICE_ATTACH, SERVICE_ATTACH_REPLY,
+};
+use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::str::FromStr;
 
@@ -148,6 +151,8 @@ pub struct RunSpace {
     node: Option<Node<ipc::Service>>,
     presence: Option<Presence>,
     run: RunName,
+    /// Where the run's bells are.
+    pub(super) bells_path: PathBuf,
 }
 
 /// Frames in flight per connection: in lockstep one is being read while the next arrives.
@@ -185,7 +190,8 @@ impl RunSpace {
         if begins {
             sweep_dead_runs();
         }
-        Ok(RunSpace { node: Some(node), presence, run: run.clone() })
+        let bells_path = Path::new(SHARED_MEMORY).join(format!("{}bells", place.prefix));
+        Ok(RunSpace { node: Some(node), presence, run: run.clone(), bells_path })
     }
 
     pub(super) fn node(&self) -> &Node<ipc::Service> {
@@ -283,6 +289,7 @@ impl RunSpace {
             .open()
             .map_err(|e| open_error(SERVICE_ATTACH_REPLY, e))?;
         Ok(AttachLine {
+            world: self.bells()?.rope(Role::World, 0),
             replies: replies
                 .subscriber_builder()
                 .create()
@@ -408,6 +415,8 @@ impl AttachDesk {
 /// A participant's side of attaching.
 #[derive(Debug)]
 pub struct AttachLine {
+    /// It may be asleep.
+    world: BellRope,
     requests: Publisher<ipc::Service, AttachRequest, ()>,
     replies: Subscriber<ipc::Service, [u8], AttachReply>,
 }
@@ -431,7 +440,9 @@ impl ReplyFrame {
 impl AttachLine {
     /// Sends a request.
     pub fn request(&self, request: AttachRequest) -> Result<(), TransportError> {
-        self.requests.send_copy(request).map(|_| ()).map_err(|e| attach_failure(SERVICE_ATTACH, &e))
+        self.requests.send_copy(request).map_err(|e| attach_failure(SERVICE_ATTACH, &e))?;
+        self.world.ring();
+        Ok(())
     }
 
     /// The next reply, if there is one; possibly to somebody else.
