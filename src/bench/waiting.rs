@@ -112,6 +112,9 @@ pub struct WaitingReport {
 /// A side that takes longer than this is not run again under the same load, s: it is out of the question.
 const TOO_LONG_S: f64 = 10.0;
 
+/// How often a run is tried.
+const TRIES: usize = 3;
+
 /// Keeps cores busy until dropped.
 struct Busy(Vec<Child>);
 
@@ -177,7 +180,14 @@ fn scene_under_load(
             if !is_possible(scene, side) || runs.iter().any(|run| run.wall_s > TOO_LONG_S) {
                 continue;
             }
-            runs.push((options.run)(scene, side)?);
+            // A busy machine may break the start of a run, which is then said and tried again.
+            let mut run = (options.run)(scene, side);
+            for _ in 1..TRIES {
+                let Err(error) = &run else { break };
+                eprintln!("{scene}, {busy} busy, {side}: {error}");
+                run = (options.run)(scene, side);
+            }
+            runs.push(run?);
         }
     }
     let mut hashes = runs.iter().flatten().map(|run| run.state_hash);

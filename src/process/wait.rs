@@ -79,8 +79,8 @@ enum Manner {
         /// Time after which yielding ends too and sleeping begins.
         busy: Duration,
     },
-    /// As experience tells.
-    Learned(WaitPolicy),
+    /// As experience tells; where more processes than this want to run, somebody else does.
+    Learned(WaitPolicy, usize),
 }
 
 /// Frames are sure to come within this time while all is well; beyond it, spinning is a waste.
@@ -102,7 +102,10 @@ impl Patience {
         let manner = match mode {
             WaitMode::Block => Manner::ASLEEP,
             WaitMode::Adaptive | WaitMode::Hybrid if role == Role::Coordinator => Manner::ASLEEP,
-            WaitMode::Adaptive => Manner::Learned(WaitPolicy::new(Situation { shares_cores, may_yield })),
+            WaitMode::Adaptive => {
+                let policy = WaitPolicy::new(Situation { shares_cores, may_yield });
+                Manner::Learned(policy, hot_processes.max(cores_online()))
+            }
             // More spinners than cores would only keep each other from working.
             WaitMode::Hybrid if shares_cores => Manner::Fixed { spin: Duration::ZERO, busy },
             WaitMode::Hybrid => Manner::Fixed { spin: SPIN, busy },
@@ -119,24 +122,24 @@ impl Manner {
     fn begins_spinning(&self, gives_way: bool) -> bool {
         match self {
             Manner::Fixed { spin, busy } => !(spin.is_zero() || gives_way && spin < busy),
-            Manner::Learned(policy) => policy.begins_spinning(gives_way),
+            Manner::Learned(policy, _) => policy.begins_spinning(gives_way),
         }
     }
 
     /// Whether the time each yield takes says something.
     fn times_yields(&self) -> bool {
-        matches!(self, Manner::Learned(_))
+        matches!(self, Manner::Learned(..))
     }
 }
 
-/// Whether more processes want to run than the machine has cores; not where the system does not tell.
-fn more_run_than_cores() -> bool {
+/// Whether more processes than this want to run; not where the system does not tell.
+fn more_run_than(room: usize) -> bool {
     // See proc(5): the fourth field is those that run or wait to run, a slash, and all there are.
     let mut text = [0; 64];
     let length = std::fs::File::open("/proc/loadavg").and_then(|mut file| file.read(&mut text)).unwrap_or(0);
     let load = std::str::from_utf8(&text[..length]).unwrap_or_default();
     let runnable = load.split_whitespace().nth(3).and_then(|field| field.split('/').next()?.parse().ok());
-    runnable.is_some_and(|runnable: usize| runnable > cores_online())
+    runnable.is_some_and(|runnable: usize| runnable > room)
 }
 
 /// A driver of a participant.
@@ -202,7 +205,7 @@ impl Waiter {
             return;
         }
         self.advice = None;
-        if let Manner::Learned(policy) = &mut self.patience.manner {
+        if let Manner::Learned(policy, _) = &mut self.patience.manner {
             policy.came(monotonic_ns);
         }
         if self.since.take().is_none() {
@@ -241,7 +244,7 @@ impl Waiter {
                         _ => Advice::Sleep,
                     }
                 }
-                Manner::Learned(policy) => policy.look(now, gives_way, more_run_than_cores),
+                Manner::Learned(policy, room) => policy.look(now, gives_way, || more_run_than(*room)),
             });
         }
         match self.advice {
@@ -267,7 +270,7 @@ impl Waiter {
         }
         self.lies_down = false;
         let rung_at = bell.sleep(bound(BELL_NAP));
-        if let Manner::Learned(policy) = &mut self.patience.manner {
+        if let Manner::Learned(policy, _) = &mut self.patience.manner {
             policy.slept(monotonic_ns(), rung_at);
         }
     }
