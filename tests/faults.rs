@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Process, Site, children, is_alive, send, ticks, wait_until, wait_within};
+use common::{ENDLESS, Process, Site, children, is_alive, send, ticks, wait_until, wait_within};
 use rustix::process::Signal;
 use std::time::Duration;
 
@@ -12,24 +12,6 @@ use std::time::Duration;
 const SOON: Duration = Duration::from_secs(5);
 /// For what the processes do by themselves once a peer is gone; the machine may be busy with other tests.
 const BY_THEMSELVES: Duration = Duration::from_secs(10);
-
-/// The two zones under steady demand for a thousand hours: no machine gets to the end of it.
-const ENDLESS: [&str; 13] = [
-    "varying-demand",
-    "--set",
-    "end.time_s=3600000",
-    "--set",
-    "roads.main1.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
-    "--set",
-    "roads.merge1.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
-    "--set",
-    "roads.merge2.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
-    "--peer-timeout",
-    "60",
-    // Whom others replace: tests/replacement.rs.
-    "--restart",
-    "never",
-];
 
 /// A process that waits for others uses next to no processor time; one that steps uses all it gets.
 fn wait_until_stepping(world: u32) {

@@ -5,7 +5,7 @@ use super::args::{
 };
 use super::record::Recording;
 use super::run::own_name;
-use super::supervise::{Plan, supervise};
+use super::supervise::{Plan, conduct};
 use super::{AppError, print};
 use crate::bench::{
     self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport, Sumo,
@@ -110,11 +110,13 @@ pub(super) fn run_as(
         }
         None => None,
     };
-    let (outcome, recording) = supervise(&plan, recording, |_| {});
-    if let Some(recording) = recording {
-        recording.finish(&outcome).map_err(words)?;
-    }
-    outcome.map_err(words)
+    let mut outcome = None;
+    conduct(&plan, recording, None, |result| {
+        outcome = Some(result);
+        Ok(())
+    })
+    .map_err(words)?;
+    Ok(outcome.expect("a run that has not failed has results"))
 }
 
 fn latency(quick: bool) -> Result<LatencyReport, AppError> {

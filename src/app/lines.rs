@@ -28,6 +28,8 @@ pub(super) enum PartLine {
     Settled(Settled),
     /// When it ends, if it is a coordinator or controller: whose frames it has refused.
     Refused(RefusedFrames),
+    /// The keeper of a plug-in: the process of the plug-in. Whoever else says so deceives nobody but readers.
+    Keeps(u32),
 }
 
 impl PartLine {

@@ -14,6 +14,7 @@ mod record;
 mod report;
 mod resume;
 mod run;
+mod say;
 mod sdk;
 mod show;
 mod supervise;
@@ -114,6 +115,7 @@ pub fn cz() -> ExitCode {
             args::Command::World(args) => parts::world(&args),
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
+            args::Command::Keep(args) => supervise::keep(&args),
             args::Command::Plan(args) => plan::plan(&args),
             args::Command::Show(args) => show::show(&args),
             args::Command::Verify(args) => record::verify(&args),
@@ -151,7 +153,7 @@ fn finish(program: &str, result: Result<(), AppError>) -> ExitCode {
     match result {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("{program}: {}", error.words());
+            say::say(format_args!("{program}: {}", error.words()));
             ExitCode::from(error.exit_code())
         }
     }

@@ -4,6 +4,7 @@ use super::args::{PartArgs, Restart, WaitArgs, WorldArgs};
 use super::lines::{PartLine, WorldLine};
 use super::record::Recording;
 use super::report::{Summary, Transport};
+use super::say::say;
 use super::{AppError, record, report};
 use crate::lockstep::RefusedFrames;
 use crate::process::{
@@ -61,17 +62,17 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         record_lag: args.conduct.record_lag(),
         run_id: Some(run_id),
     };
-    let report = report_to(args.supervised, &args.conduct.wait);
-    let settling = settling(&args.conduct.wait, &*report);
+    let tell = report_to(args.supervised, &args.conduct.wait);
+    let settling = settling(&args.conduct.wait, &*tell);
     if args.supervised.is_some() {
         let mut last = Instant::now();
         let outcome = run_world(&scenario, &options, past, &settling, &stop, |world| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
-                say(&WorldLine::progress(world));
+                report(&WorldLine::progress(world));
             }
         })?;
-        say(&WorldLine::Outcome(Box::new(outcome)));
+        report(&WorldLine::Outcome(Box::new(outcome)));
         return Ok(());
     }
     let outcome = run_world(&scenario, &options, past, &settling, &stop, |_: &World| {});
@@ -111,8 +112,8 @@ fn settling<'a>(wait: &WaitArgs, report: &'a dyn Fn(&Settled)) -> Settling<'a> {
 /// people when they have asked.
 fn report_to(supervisor: Option<u32>, wait: &WaitArgs) -> Box<dyn Fn(&Settled)> {
     match (supervisor, wait.rt) {
-        (Some(_), _) => Box::new(|settled| eprintln!("{}", PartLine::Settled(settled.clone()).to_line())),
-        (None, true) => Box::new(|settled| eprintln!("{settled}")),
+        (Some(_), _) => Box::new(|settled| say(PartLine::Settled(settled.clone()).to_line())),
+        (None, true) => Box::new(|settled| say(settled)),
         (None, false) => Box::new(|_| {}),
     }
 }
@@ -121,8 +122,8 @@ fn report_to(supervisor: Option<u32>, wait: &WaitArgs) -> Box<dyn Fn(&Settled)> 
 fn refused_to(args: &PartArgs) -> impl Fn(RefusedFrames) + use<> {
     let is_supervised = args.supervised.is_some();
     move |refused| match is_supervised {
-        true => eprintln!("{}", PartLine::Refused(refused).to_line()),
-        false => eprintln!("{refused}"),
+        true => say(PartLine::Refused(refused).to_line()),
+        false => say(refused),
     }
 }
 
@@ -136,7 +137,7 @@ fn prepare(args: &PartArgs, role: Role) -> Result<(Joining, StopFlag), AppError>
 }
 
 /// Has the kernel send SIGTERM when the supervisor dies, however it dies.
-fn follow_supervisor(supervisor: Option<u32>) -> Result<(), AppError> {
+pub(super) fn follow_supervisor(supervisor: Option<u32>) -> Result<(), AppError> {
     use rustix::process::{Signal, getppid, set_parent_process_death_signal};
     let Some(supervisor) = supervisor else { return Ok(()) };
     set_parent_process_death_signal(Some(Signal::TERM))
@@ -147,7 +148,7 @@ fn follow_supervisor(supervisor: Option<u32>) -> Result<(), AppError> {
 }
 
 /// One line of JSON to the supervisor; if it has gone, a signal is under way.
-fn say(line: &WorldLine) {
+fn report(line: &WorldLine) {
     let mut out = std::io::stdout().lock();
     let _ = serde_json::to_writer(&mut out, line);
     let _ = out.write_all(b"\n").and_then(|()| out.flush());

@@ -1,6 +1,7 @@
 //! `cz run --record`, `cz verify`, `cz replay`.
 
 use super::args::{ReplayArgs, ScenarioArgs, ShareArgs, VerifyArgs};
+use super::say::say;
 use super::show::number;
 use super::{AppError, print};
 use crate::process::RecordLag;
@@ -91,6 +92,11 @@ impl Recording {
         Ok(Recording::of(recorder, path))
     }
 
+    /// The file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
     /// Records a step of a run in this process, which may wait for the disk.
     pub fn push(&mut self, frames: &StepFrames<'_>) {
         if self.failure.is_none() && !self.recorder.push_or_wait(frames) {
@@ -114,7 +120,7 @@ impl Recording {
     fn note_failure(&mut self) {
         self.failure = self.recorder.failure();
         if let Some(error) = &self.failure {
-            eprintln!("cz: {error}; the run goes on without being recorded");
+            say(format_args!("cz: {error}; the run goes on without being recorded"));
         }
     }
 
@@ -131,17 +137,17 @@ impl Recording {
         }
         let recorded = recorded?;
         if recorded.steps == 0 {
-            eprintln!("recorded nothing: {} is as it was", self.path.display());
+            say(format_args!("recorded nothing: {} is as it was", self.path.display()));
             return Ok(());
         }
         let (path, size) = (self.path.display(), bytes(recorded.bytes));
-        eprintln!("recorded {} in {path} ({size})", number(recorded.steps, "step"));
+        say(format_args!("recorded {} in {path} ({size})", number(recorded.steps, "step")));
         if !recorded.missing.is_empty() {
-            eprintln!(
+            say(format_args!(
                 "not in it, because it came faster than it could be written: {}, {}",
                 number(recorded.missing_steps(), "step"),
                 ranges(&recorded.missing)
-            );
+            ));
         }
         Ok(())
     }

@@ -4,7 +4,8 @@ use super::args::{BranchArgs, ResumeArgs, ScenarioArgs};
 use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::run::{Bar, own_name};
-use super::supervise::{Plan, supervise};
+use super::say::say;
+use super::supervise::{Plan, conduct};
 use super::{AppError, print, record, report};
 use crate::process::{RestoreError, StopFlag, first_missing_step, new_run_id, restore, run_on_in_process};
 use crate::record::{FileSource, Reader, is_growing};
@@ -39,7 +40,7 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         let problem = format!("{}: the run is complete; nothing is left to be resumed", args.file.display());
         return Err(AppError::Usage(problem));
     }
-    eprintln!("{} has {first} steps; the run goes on with step {first}", args.file.display());
+    say(format_args!("{} has {first} steps; the run goes on with step {first}", args.file.display()));
     let share = record::share_of(&reader);
     let none = ScenarioArgs::none();
     let plan = Plan {
@@ -60,14 +61,12 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         None => None,
     };
     let bar = Bar::new(&scenario);
-    let (outcome, recording) = supervise(&plan, recording, |position| bar.show(position));
-    bar.finish();
-    let recorded = record::finish(recording, args.record.as_deref(), &outcome);
     let processes = 1 + share.coord_procs + scenario.controllers(share.ctrl_procs);
     let asked = args.supervised.conduct.wait.asks_for_placement();
-    let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome?);
-    summary.with_placement(asked).deliver(args.supervised.json.as_deref())?;
-    recorded
+    conduct(&plan, recording, Some(&bar), |outcome| {
+        let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome);
+        summary.with_placement(asked).deliver(args.supervised.json.as_deref())
+    })
 }
 
 pub(super) fn branch(args: &BranchArgs) -> Result<(), AppError> {

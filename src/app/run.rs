@@ -1,10 +1,10 @@
 //! `cz run`: a whole run, in this process or in several.
 
-use super::args::RunArgs;
+use super::args::{RunArgs, ScenarioArgs};
 use super::record::Recording;
 use super::report::{Summary, Transport};
-use super::supervise::{self, Plan};
-use super::{AppError, controllers, record, report};
+use super::supervise::{Plan, conduct};
+use super::{AppError, controllers, report};
 use crate::lockstep::in_process::InProcess;
 use crate::process::{StopFlag, WaitMode, check_cores, new_run_id, run_in_process, run_in_process_observed};
 use crate::scenario::Scenario;
@@ -34,59 +34,62 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         return Err(AppError::Usage(problem.to_owned()));
     }
     let bar = Bar::new(&scenario);
-    let mut recorded = Ok(());
-    let (transport, outcome) = if args.in_process {
-        let stop = StopFlag::from_signals()?;
-        let shares = args.share;
-        let (coordinators, controllers) = (shares.coord_procs, shares.ctrl_procs);
-        let progress = |world: &World| bar.show(Position::of(world));
-        let outcome = match &args.record {
-            None => {
-                run_in_process(&scenario, coordinators, controllers, &stop, progress).map_err(AppError::from)
-            }
-            Some(path) => {
-                let mut recording = Recording::start(path, &arguments, &scenario, shares, InProcess::RUN_ID)?;
-                let outcome =
-                    run_in_process_observed(&scenario, coordinators, controllers, &stop, progress, |f| {
-                        recording.push(f);
-                    })
-                    .map_err(AppError::from);
-                bar.finish();
-                recorded = recording.finish(&outcome);
-                outcome
-            }
-        };
-        (Transport::InProcess, outcome)
-    } else {
-        let processes = 1 + args.share.coord_procs + scenario.controllers(args.share.ctrl_procs);
-        let plan = Plan {
-            run: args.supervised.run.clone().unwrap_or_else(own_name),
-            scenario: &arguments,
-            plugins: &scenario.plugins,
-            pool: scenario.controllers(args.share.ctrl_procs) - scenario.plugins.len() as u32,
-            share: args.share,
-            conduct: args.supervised.conduct,
-            run_id: new_run_id(),
-            resume: None,
-        };
-        let recording = match &args.record {
-            Some(path) => {
-                let recording = Recording::start(path, &arguments, &scenario, args.share, plan.run_id)?;
-                Some(recording.lagging(args.supervised.conduct.record_lag()))
-            }
-            None => None,
-        };
-        let (outcome, recording) = supervise::supervise(&plan, recording, |position| bar.show(position));
-        bar.finish();
-        recorded = record::finish(recording, args.record.as_deref(), &outcome);
-        (Transport::Iceoryx2 { processes }, outcome)
+    if args.in_process {
+        return run_here(args, &arguments, &scenario, &bar);
+    }
+    let processes = 1 + args.share.coord_procs + scenario.controllers(args.share.ctrl_procs);
+    let plan = Plan {
+        run: args.supervised.run.clone().unwrap_or_else(own_name),
+        scenario: &arguments,
+        plugins: &scenario.plugins,
+        pool: scenario.controllers(args.share.ctrl_procs) - scenario.plugins.len() as u32,
+        share: args.share,
+        conduct: args.supervised.conduct,
+        run_id: new_run_id(),
+        resume: None,
     };
-    bar.finish();
+    let recording = match &args.record {
+        Some(path) => {
+            let recording = Recording::start(path, &arguments, &scenario, args.share, plan.run_id)?;
+            Some(recording.lagging(args.supervised.conduct.record_lag()))
+        }
+        None => None,
+    };
     let asked = args.supervised.conduct.wait.asks_for_placement();
-    Summary::new(&scenario, transport, outcome?)
-        .with_placement(asked)
-        .deliver(args.supervised.json.as_deref())?;
+    conduct(&plan, recording, Some(&bar), |outcome| {
+        let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome);
+        summary.with_placement(asked).deliver(args.supervised.json.as_deref())
+    })
+}
+
+/// A whole run in this process.
+fn run_here(
+    args: &RunArgs,
+    arguments: &ScenarioArgs,
+    scenario: &Arc<Scenario>,
+    bar: &Bar,
+) -> Result<(), AppError> {
+    let stop = StopFlag::from_signals()?;
+    let shares = args.share;
+    let (coordinators, controllers) = (shares.coord_procs, shares.ctrl_procs);
+    let progress = |world: &World| bar.show(Position::of(world));
+    let mut recording = match &args.record {
+        Some(path) => Some(Recording::start(path, arguments, scenario, shares, InProcess::RUN_ID)?),
+        None => None,
+    };
+    let outcome = match &mut recording {
+        None => run_in_process(scenario, coordinators, controllers, &stop, progress),
+        Some(recording) => {
+            run_in_process_observed(scenario, coordinators, controllers, &stop, progress, |f| {
+                recording.push(f);
+            })
+        }
+    };
+    let outcome = outcome.map_err(AppError::from);
+    bar.finish();
     // A recording that failed does not take the results with it.
+    let recorded = recording.map_or(Ok(()), |recording| recording.finish(&outcome));
+    Summary::new(scenario, Transport::InProcess, outcome?).deliver(args.supervised.json.as_deref())?;
     recorded
 }
 

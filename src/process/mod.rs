@@ -4,6 +4,7 @@ mod attach;
 mod house;
 mod observe;
 mod outcome;
+mod own_time;
 mod pace;
 mod participant;
 mod peers;
@@ -22,15 +23,16 @@ mod world;
 pub use attach::{Attachment, Joining};
 pub use observe::{Observation, RecordLag};
 pub use outcome::{LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, new_histogram};
+pub use own_time::{Bound, OwnTime};
 pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
 pub use participant::{run_controller, run_coordinator};
-pub use peers::{Peer, Peers};
+pub use peers::{Peer, Peers, children_of, is_stopped};
 pub use placement::{Affinity, Placement, place, unplaced};
 pub use realtime::{Held, Settled, Settling};
 pub use restore::{RestoreError, restore};
 pub use run_spec::plugin_bytes;
 pub use services::expected_vehicles;
-pub use stop::StopFlag;
+pub use stop::{StopFlag, signals_to_heed};
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
     WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process, run_in_process_observed,

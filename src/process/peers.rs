@@ -56,6 +56,26 @@ pub(super) fn is_alive(process_id: u32) -> bool {
     }
 }
 
+/// The fields of /proc/PID/stat behind the command name, which is in parentheses and may hold any character.
+fn stat(process_id: u32) -> Option<String> {
+    let stat = std::fs::read_to_string(format!("/proc/{process_id}/stat")).ok()?;
+    stat.rsplit(')').next().map(|rest| rest.trim_start().to_owned())
+}
+
+/// Whether a process is stopped, by a signal or by a debugger.
+pub fn is_stopped(process_id: u32) -> bool {
+    stat(process_id).is_some_and(|fields| fields.starts_with(['T', 't']))
+}
+
+/// The processes whose parent a process is, whether they run or are waiting to be reaped.
+pub fn children_of(process_id: u32) -> Vec<u32> {
+    let parent = process_id.to_string();
+    let ids = std::fs::read_dir("/proc").into_iter().flatten().flatten();
+    ids.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
+        .filter(|id| stat(*id).is_some_and(|fields| fields.split_whitespace().nth(1) == Some(&parent)))
+        .collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -29,6 +29,24 @@ pub const LONG_RUN: [&str; 9] = [
     "roads.merge2.demand.rates=[{until_s=10000.0,vehicles_per_hour=300.0}]",
 ];
 
+/// The two zones under steady demand for a thousand hours: no machine gets to the end of it.
+pub const ENDLESS: [&str; 13] = [
+    "varying-demand",
+    "--set",
+    "end.time_s=3600000",
+    "--set",
+    "roads.main1.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge1.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
+    "--set",
+    "roads.merge2.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
+    "--peer-timeout",
+    "60",
+    // Whom others replace: tests/replacement.rs.
+    "--restart",
+    "never",
+];
+
 static NEXT: AtomicU32 = AtomicU32::new(0);
 
 /// A run name nobody else uses: /dev/shm is shared with all other tests.
@@ -63,6 +81,7 @@ impl Site {
             "cz-world" => env!("CARGO_BIN_EXE_cz-world"),
             "cz-coord" => env!("CARGO_BIN_EXE_cz-coord"),
             "cz-ctrl" => env!("CARGO_BIN_EXE_cz-ctrl"),
+            "sh" => "sh",
             other => panic!("there is no program {other}"),
         };
         let mut command = Command::new(path);
@@ -166,6 +185,12 @@ impl Process {
         self.child.id()
     }
 
+    /// What it has said on stdout and stderr until now.
+    pub fn said_so_far(&self) -> (String, String) {
+        let read = |path| String::from_utf8_lossy(&std::fs::read(path).unwrap()).into_owned();
+        (read(&self.out), read(&self.err))
+    }
+
     pub fn signal(&self, signal: Signal) {
         send(self.id(), signal);
     }
@@ -238,6 +263,19 @@ impl Ended {
 /// The state hash of a summary.
 pub fn hash(summary: &serde_json::Value) -> String {
     summary["state_hash"].as_str().expect("state_hash is a string").to_owned()
+}
+
+/// The path of an example controller of the Rust SDK, which is built first.
+pub fn example(name: &str) -> String {
+    let cz = Path::new(env!("CARGO_BIN_EXE_cz"));
+    let mut build = Command::new(env!("CARGO"));
+    build.current_dir(env!("CARGO_MANIFEST_DIR"));
+    build.args(["build", "-q", "-p", "control-zones-plugin", "--example", name]);
+    if cz.parent().is_some_and(|directory| directory.ends_with("release")) {
+        build.arg("--release");
+    }
+    assert!(build.status().unwrap().success());
+    cz.parent().unwrap().join("examples").join(name).display().to_string()
 }
 
 /// Waits for something that must happen soon.

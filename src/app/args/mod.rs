@@ -12,7 +12,7 @@ pub(super) use bench::{BenchArgs, BenchKind, PeerArgs, WaitBenchArgs};
 use clap::{Args, Parser, Subcommand};
 pub(super) use conduct::{ConductArgs, Restart, ShareArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
-pub(super) use run::{PartArgs, RunArgs, SupervisedArgs, WorldArgs};
+pub(super) use run::{KeepArgs, PartArgs, RunArgs, SupervisedArgs, WorldArgs};
 pub(super) use scenario::ScenarioArgs;
 use std::path::PathBuf;
 
@@ -37,6 +37,9 @@ pub(super) enum Command {
     Coord(PartArgs),
     /// Start only a controller of a run (the same as the program cz-ctrl).
     Ctrl(PartArgs),
+    /// Start a controller written elsewhere and end it with its supervisor.
+    #[command(hide = true)]
+    Keep(KeepArgs),
     /// Compute one reference trajectory: duration, coefficients, cost.
     Plan(PlanArgs),
     /// Show a recording: what it is of, one of its steps, or a vehicle's course.

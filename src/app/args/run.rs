@@ -92,3 +92,13 @@ pub(in crate::app) struct PartArgs {
     #[arg(long, hide = true, value_name = "PID")]
     pub supervised: Option<u32>,
 }
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct KeepArgs {
+    /// Process id of the supervisor.
+    #[arg(long, value_name = "PID")]
+    pub supervised: u32,
+    /// The command, for `sh -c`.
+    #[arg(last = true, value_name = "COMMAND")]
+    pub command: String,
+}

@@ -1,0 +1,107 @@
+//! `cz keep`: the keeper of a plug-in. It starts the plug-in's command, and ends it and whatever that has started
+//! when it is asked to, when its supervisor dies, and when the command fails. It ends as the command ended.
+
+use super::child;
+use super::life::GRACE;
+use crate::app::AppError;
+use crate::app::args::KeepArgs;
+use crate::app::lines::PartLine;
+use crate::app::parts::follow_supervisor;
+use crate::app::say::say;
+use crate::process::children_of;
+use rustix::io::Errno;
+use rustix::process::{
+    Pid, Resource, Rlimit, Signal, WaitOptions, WaitStatus, getpid, kill_process_group, set_child_subreaper,
+    setrlimit, wait,
+};
+use signal_hook::consts::{SIGCHLD, SIGHUP, SIGINT, SIGKILL, SIGTERM};
+use signal_hook::iterator::Signals;
+use std::os::unix::process::CommandExt;
+use std::process::{Command, Stdio};
+use std::thread;
+use std::time::Duration;
+
+/// What a command that has failed has left running may take this long to end.
+const GRACE_AFTER_FAILURE: Duration = Duration::from_millis(300);
+/// Time between two rounds of killing: whose parent dies becomes our child.
+const ROUND: Duration = Duration::from_millis(10);
+
+/// Does not return once the command has been started.
+pub(in crate::app) fn keep(args: &KeepArgs) -> Result<(), AppError> {
+    let failed = |what: &str, why: &dyn std::fmt::Display| AppError::Failed(format!("{what}: {why}"));
+    let mut signals =
+        Signals::new([SIGTERM, SIGINT, SIGHUP, SIGCHLD]).map_err(|e| failed("cannot handle signals", &e))?;
+    // Whoever loses its parent comes to us, so that nobody gets away by leaving its group.
+    set_child_subreaper(Some(getpid())).map_err(|e| failed("cannot keep what the command starts", &e))?;
+    follow_supervisor(Some(args.supervised))?;
+    let child = Command::new("sh")
+        .args(["-c", &args.command])
+        .stdin(Stdio::null())
+        .process_group(0)
+        .spawn()
+        .map_err(|e| failed("cannot start sh", &e))?;
+    say(PartLine::Keeps(child.id()).to_line());
+    let group = Pid::from_raw(child.id() as i32).expect("a process has an id");
+    let mut status = None;
+    let mut is_ending = false;
+    loop {
+        if !reap_all(group, &mut status) {
+            end_like(status);
+        }
+        let has_failed = status.is_some_and(|status| status.exit_status() != Some(0));
+        if has_failed && !is_ending {
+            is_ending = true;
+            end_all(group, GRACE_AFTER_FAILURE);
+        }
+        if signals.wait().any(|signal| signal != SIGCHLD) && !is_ending {
+            is_ending = true;
+            end_all(group, GRACE);
+        }
+    }
+}
+
+/// Reaps whoever has ended; returns whether there are any left.
+fn reap_all(command: Pid, status: &mut Option<WaitStatus>) -> bool {
+    loop {
+        match wait(WaitOptions::NOHANG) {
+            Ok(Some((pid, how))) if pid == command => *status = Some(how),
+            Ok(Some(_)) | Err(Errno::INTR) => {}
+            Ok(None) => return true,
+            Err(_) => return false,
+        }
+    }
+}
+
+/// Asks everybody to end, and insists after a while. A command that has left helpers behind and ended well still
+/// counts as running, as one that puts itself into the background must.
+fn end_all(group: Pid, grace: Duration) {
+    let own = std::process::id();
+    let _ = kill_process_group(group, Signal::TERM);
+    children_of(own).into_iter().for_each(|process| child::signal(process, Signal::TERM));
+    let insist = move || {
+        thread::sleep(grace);
+        loop {
+            let _ = kill_process_group(group, Signal::KILL);
+            children_of(own).into_iter().for_each(|process| child::signal(process, Signal::KILL));
+            thread::sleep(ROUND);
+        }
+    };
+    if thread::Builder::new().spawn(insist).is_err() {
+        let _ = kill_process_group(group, Signal::KILL);
+    }
+}
+
+/// Ends as the command has.
+fn end_like(status: Option<WaitStatus>) -> ! {
+    let Some(status) = status else { std::process::exit(1) };
+    if let Some(signal) = status.terminating_signal() {
+        // Not again a core that the command has left already.
+        let _ = setrlimit(Resource::Core, Rlimit { current: Some(0), maximum: Some(0) });
+        if signal == SIGKILL {
+            child::signal(std::process::id(), Signal::KILL);
+        }
+        let _ = signal_hook::low_level::emulate_default_handler(signal);
+        std::process::exit(128 + signal);
+    }
+    std::process::exit(status.exit_status().unwrap_or(1))
+}

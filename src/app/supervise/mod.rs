@@ -1,0 +1,386 @@
+//! The supervisor: starts the processes of a run, watches them, and leaves nothing behind.
+//!
+//! What is to be done is decided by [`life`]; this is its shell.
+
+mod child;
+mod keep;
+mod life;
+
+use super::{AppError, record};
+use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs};
+use super::lines::{PartLine, WorldLine};
+use super::record::Recording;
+use super::run::{Bar, Position};
+use super::say::Crier;
+use crate::lockstep::RefusedFrames;
+use crate::process::{
+    Observation, Outcome, OwnTime, ProcessError, Settled, children_of, is_stopped, signals_to_heed,
+};
+use crate::record::Reader;
+use crate::scenario::Plugin;
+use crate::transport::iox::{RunName, RunSpace};
+use child::{Event, Stdout};
+use crossbeam::channel::{Receiver, Sender, bounded, select, unbounded};
+pub(super) use keep::keep;
+use life::{Act, Failure, GRACE, Kind, Life, Stage};
+use rustix::process::{Signal, getpid, set_child_subreaper};
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+/// What to start.
+#[derive(Clone, Debug)]
+pub(super) struct Plan<'a> {
+    pub run: RunName,
+    pub scenario: &'a ScenarioArgs,
+    pub share: ShareArgs,
+    /// Controllers written elsewhere.
+    pub plugins: &'a [Plugin],
+    /// Number of processes of the built-in pool.
+    pub pool: u32,
+    pub conduct: ConductArgs,
+    /// Id of the run.
+    pub run_id: u64,
+    /// The recording the run goes on from, and so many of its steps.
+    pub resume: Option<(&'a Path, u64)>,
+}
+
+/// Events that may wait to be dealt with: whoever floods us waits.
+const WAITING: usize = 1024;
+/// The clock is looked at this often.
+const LOOK: Duration = Duration::from_secs(1);
+/// Of what a process has said last, this much is in a message, characters.
+const LAST_WORDS: usize = 500;
+
+/// Runs a plan to its end. Results come first: they are handed to `deliver` as soon as they are complete, before the
+/// recording is closed and whoever lingers is ended.
+pub(super) fn conduct(
+    plan: &Plan<'_>,
+    recording: Option<Recording>,
+    bar: Option<&Bar>,
+    deliver: impl FnOnce(Outcome) -> Result<(), AppError>,
+) -> Result<(), AppError> {
+    let path = recording.as_ref().map(|recording| recording.path().to_owned());
+    let mut observation = None;
+    let mut recording = recording;
+    let mut watch = || {
+        claim(&plan.run)?;
+        let mut family = Family::new(plan, recording.is_some())?;
+        observation = recording.take().map(|recording| {
+            Observation::start(plan.run.clone(), recording, |r: &mut Recording, step, b| {
+                r.push_block(step, b)
+            })
+        });
+        let outcome = family.watch(|position| bar.iter().for_each(|bar| bar.show(position)));
+        Ok((family, outcome))
+    };
+    let (family, outcome) = match watch() {
+        Ok((family, outcome)) => (Some(family), outcome),
+        Err(error) => (None, Err(error)),
+    };
+    bar.iter().for_each(|bar| bar.finish());
+    let (outcome, delivered) = match outcome {
+        Ok(outcome) => (Ok(()), deliver(outcome)),
+        Err(error) => (Err(error), Ok(())),
+    };
+    let recording = match observation.map(Observation::stop) {
+        Some(Ok(recording)) => Some(recording),
+        Some(Err(error)) => {
+            super::say::say(format_args!("cz: the recording broke off: {error}"));
+            None
+        }
+        None => recording,
+    };
+    let recorded = record::finish(recording, path.as_deref(), &outcome);
+    if let Some(family) = family {
+        family.close();
+        // Whoever is still alive in the space keeps it; then there is nothing to be swept.
+        let _ = RunSpace::sweep(&plan.run);
+    }
+    outcome.map_err(|error| point_to(path, error)).and(delivered).and(recorded)
+}
+
+/// Says how the run can go on, where something of it has been recorded.
+fn point_to(recording: Option<PathBuf>, error: AppError) -> AppError {
+    let has_steps = |path: &PathBuf| Reader::open(path).is_ok_and(|reader| reader.steps().next().is_some());
+    let Some(path) = recording.filter(has_steps) else { return error };
+    let how = format!("`cz resume {}` goes on from the last step recorded", path.display());
+    match error {
+        AppError::Failed(text) => AppError::Failed(format!("{text}\n  {how}")),
+        AppError::Interrupted(text) => AppError::Interrupted(format!("{text}; {how}")),
+        other => other,
+    }
+}
+
+/// Removes what a killed supervisor of the same run may have left, and refuses a run that is active: the
+/// parts started here would take the places of its own.
+fn claim(run: &RunName) -> Result<(), AppError> {
+    // The children of a supervisor killed just now are still on their way out.
+    let deadline = Instant::now() + GRACE / 2;
+    while !RunSpace::sweep(run).map_err(ProcessError::from)? {
+        if Instant::now() >= deadline {
+            return Err(ProcessError::AlreadyActive { run: run.to_string() }.into());
+        }
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    Ok(())
+}
+
+/// How to start a process of the run.
+#[derive(Clone, Debug)]
+struct Recipe {
+    kind: Kind,
+    /// Of `cz`.
+    arguments: Vec<OsString>,
+    environment: Vec<(&'static str, String)>,
+    /// The process that was started so last.
+    process: Option<u32>,
+    /// Where it is and what it was granted.
+    settled: Option<Settled>,
+}
+
+/// The processes of a run.
+struct Family {
+    life: Life,
+    recipes: Vec<Recipe>,
+    events: Sender<Event>,
+    inbox: Receiver<Event>,
+    signals: Receiver<i32>,
+    time: OwnTime,
+    crier: Crier,
+    outcome: Option<Outcome>,
+    /// What those that have ended had refused.
+    refused: Vec<RefusedFrames>,
+}
+
+impl Family {
+    fn new(plan: &Plan<'_>, observed: bool) -> Result<Family, AppError> {
+        let failed = |what: &str, why: &dyn std::fmt::Display| AppError::Failed(format!("{what}: {why}"));
+        let (signal_sender, signals) = unbounded();
+        let mut source = signal_hook::iterator::Signals::new(signals_to_heed())
+            .map_err(|e| failed("cannot handle signals", &e))?;
+        let no_thread = |e| failed("cannot start a thread", &e);
+        std::thread::Builder::new()
+            .name("signals".to_owned())
+            .spawn(move || {
+                for signal in source.forever() {
+                    let _ = signal_sender.send(signal);
+                }
+            })
+            .map_err(no_thread)?;
+        // Whom the keeper of a plug-in can no longer end comes to us.
+        let _ = set_child_subreaper(Some(getpid()));
+        let (events, inbox) = bounded(WAITING);
+        let replaces = plan.conduct.restart == Restart::OnFailure;
+        let mut family = Family {
+            life: Life::new(replaces, plan.conduct.wait.peer_timeout),
+            recipes: Vec::new(),
+            events,
+            inbox,
+            signals,
+            time: OwnTime::start(),
+            crier: Crier::start().map_err(no_thread)?,
+            outcome: None,
+            refused: Vec::new(),
+        };
+        family.cast(plan, observed);
+        Ok(family)
+    }
+
+    /// Says who takes part.
+    fn cast(&mut self, plan: &Plan<'_>, observed: bool) {
+        let (run, supervisor) = (plan.run.to_string(), std::process::id().to_string());
+        let common = ["--run", &run, "--supervised", &supervisor].map(str::to_owned);
+        let mut world = vec!["world".to_owned()];
+        world.extend(common.clone());
+        world.extend(["--ctrl-procs".to_owned(), plan.share.ctrl_procs.to_string()]);
+        world.extend(["--coord-procs".to_owned(), plan.share.coord_procs.to_string()]);
+        world.extend(plan.conduct.to_flags());
+        world.extend(["--run-id".to_owned(), plan.run_id.to_string()]);
+        world.extend(observed.then(|| "--observed".to_owned()));
+        world.extend(plan.scenario.to_arguments());
+        world.extend(plan.resume.map(|(_, steps)| format!("--resume-steps={steps}")));
+        let mut world: Vec<_> = world.into_iter().map(OsString::from).collect();
+        if let Some((path, _)) = plan.resume {
+            let mut argument = OsString::from("--resume=");
+            argument.push(path);
+            world.insert(1, argument);
+        }
+        self.add("world".to_owned(), Kind::World, world, Vec::new());
+        for (role, command, count) in
+            [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
+        {
+            for index in 0..count {
+                let mut arguments = vec![command.to_owned()];
+                arguments.extend(common.clone());
+                arguments.extend(plan.conduct.wait.to_flags());
+                arguments.extend(["--index".to_owned(), index.to_string()]);
+                let arguments = arguments.into_iter().map(OsString::from).collect();
+                self.add(format!("{role} {index}"), Kind::Part, arguments, Vec::new());
+            }
+        }
+        for Plugin { name, command, .. } in plan.plugins {
+            let Some(command) = command else { continue };
+            let arguments = ["keep", "--supervised", &supervisor, "--", command].map(OsString::from).to_vec();
+            let environment = vec![("CZ_RUN", run.clone()), ("CZ_CONTROLLER", name.clone())];
+            self.add(format!("controller {name}"), Kind::Plugin, arguments, environment);
+        }
+    }
+
+    fn add(
+        &mut self,
+        name: String,
+        kind: Kind,
+        arguments: Vec<OsString>,
+        environment: Vec<(&'static str, String)>,
+    ) {
+        self.life.add(name, kind);
+        self.recipes.push(Recipe { kind, arguments, environment, process: None, settled: None });
+    }
+
+    /// Watches until the results are complete, or everybody has ended without any.
+    fn watch(&mut self, mut progress: impl FnMut(Position)) -> Result<Outcome, AppError> {
+        while self.go_on() == Stage::Going {
+            self.take_event(&mut progress);
+        }
+        match self.life.failure() {
+            Some(Failure::Failed(text)) => Err(AppError::Failed(text.clone())),
+            Some(Failure::Interrupted(text)) => Err(AppError::Interrupted(text.clone())),
+            None => {
+                let mut outcome = self.outcome.take().expect("a run that has not failed has results");
+                outcome.placement = self.recipes.iter_mut().filter_map(|r| r.settled.take()).collect();
+                outcome.refused.append(&mut self.refused);
+                Ok(outcome)
+            }
+        }
+    }
+
+    /// Ends whoever lingers.
+    fn close(mut self) {
+        while self.go_on() != Stage::Done {
+            self.take_event(&mut |_| {});
+        }
+        // Whoever got away from its keeper by killing it.
+        let deadline = Instant::now() + GRACE;
+        loop {
+            let orphans = children_of(std::process::id());
+            if orphans.is_empty() || Instant::now() >= deadline {
+                break;
+            }
+            for orphan in orphans {
+                child::signal(orphan, Signal::KILL);
+                child::reap(orphan);
+            }
+        }
+        // There is no summary to say it.
+        for refused in std::mem::take(&mut self.refused) {
+            self.crier.cry(format!("cz: {refused}"));
+        }
+        self.crier.finish();
+    }
+
+    /// Does what is due; says how far the run is.
+    fn go_on(&mut self) -> Stage {
+        let now = self.time.look(2 * LOOK);
+        let mut acts = Vec::new();
+        self.life.tick(now, &mut acts);
+        self.act(acts);
+        self.life.stage()
+    }
+
+    fn act(&mut self, acts: Vec<Act>) {
+        for act in acts {
+            match act {
+                Act::Start(member) => self.start(member),
+                Act::Ask(member) => self.signal(member, Signal::TERM),
+                Act::Insist(member) => self.signal(member, Signal::KILL),
+                Act::Say(line) => self.crier.cry(line),
+            }
+        }
+    }
+
+    fn start(&mut self, member: usize) {
+        let recipe = &mut self.recipes[member];
+        // A build may have replaced the program since.
+        let own = std::env::current_exe().ok().filter(|path| path.exists());
+        let mut command = Command::new(own.unwrap_or_else(|| "/proc/self/exe".into()));
+        command.args(&recipe.arguments).envs(recipe.environment.iter().cloned());
+        let stdout = match recipe.kind {
+            Kind::World => Stdout::Report,
+            Kind::Part => Stdout::Nobody,
+            Kind::Plugin => Stdout::Lines,
+        };
+        let now = self.time.look(2 * LOOK);
+        match child::start(command, member, stdout, &self.events) {
+            Ok(process) => {
+                recipe.process = Some(process);
+                self.life.started(member, process, now);
+            }
+            Err(error) => self.life.did_not_start(member, &error.to_string(), now),
+        }
+    }
+
+    fn signal(&self, member: usize, signal: Signal) {
+        if let Some(process) = self.recipes[member].process {
+            child::signal(process, signal);
+        }
+    }
+
+    /// Waits for something to happen, and takes it.
+    fn take_event(&mut self, progress: &mut impl FnMut(Position)) {
+        let now = self.time.look(2 * LOOK);
+        let patience = self.life.next_due().map_or(LOOK, |due| due.saturating_sub(now).min(LOOK));
+        select! {
+            recv(self.signals) -> signal => {
+                let name = signal.ok().and_then(signal_hook::low_level::signal_name).unwrap_or("a signal");
+                let now = self.time.look(2 * LOOK);
+                self.life.interrupted(name, now);
+            }
+            recv(self.inbox) -> event => self.take(event.expect("the family holds a sender"), progress),
+            default(patience) => {}
+        }
+    }
+
+    fn take(&mut self, event: Event, progress: &mut impl FnMut(Position)) {
+        let now = self.time.look(2 * LOOK);
+        let mut acts = Vec::new();
+        match event {
+            Event::World(WorldLine::Progress(position)) => {
+                self.life.stepped(now);
+                progress(position);
+            }
+            Event::World(WorldLine::Outcome(outcome)) => {
+                self.outcome = Some(*outcome);
+                self.life.results_are_in(now, &mut acts);
+            }
+            Event::Said { member, line } => self.take_words(member, line),
+            Event::Printed { member, line } => {
+                let name = self.life.name(member).trim_start_matches("controller ");
+                self.crier.cry(format!("[{name}] {line}"));
+            }
+            Event::Ended { member, process } => {
+                let end = child::reap(process);
+                self.recipes[member].process = None;
+                self.life.ended(member, &end, now, is_stopped, &mut acts);
+            }
+        }
+        self.act(acts);
+    }
+
+    /// Takes a line of somebody's stderr.
+    fn take_words(&mut self, member: usize, line: String) {
+        match (self.recipes[member].kind, PartLine::of(&line)) {
+            (Kind::Plugin, Some(PartLine::Keeps(plugin))) => return self.life.is_process(member, plugin),
+            (Kind::Plugin, _) => self.crier.cry(format!("[{}] {line}", self.life.name(member))),
+            (_, Some(PartLine::Settled(settled))) => {
+                self.life.settled(member);
+                self.recipes[member].settled = Some(settled);
+                return;
+            }
+            (_, Some(PartLine::Refused(refused))) => return self.refused.push(refused),
+            (_, _) => {}
+        }
+        self.life.said(member, line.chars().take(LAST_WORDS).collect());
+    }
+}
