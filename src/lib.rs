@@ -8,6 +8,7 @@ pub mod coordination;
 pub mod encoding;
 mod lanes;
 pub mod lockstep;
+pub mod own_time;
 pub mod process;
 pub mod record;
 pub mod reproduce;

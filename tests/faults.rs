@@ -203,3 +203,103 @@ fn a_part_that_stops_answering_is_given_up() {
     controller.ended_within(BY_THEMSELVES).expect(1, &["the world", "gone"]);
     site.assert_clean();
 }
+
+#[test]
+fn a_run_that_was_stopped_as_a_whole_goes_on() {
+    let site = Site::new("slept");
+    // Stopped for three times as long as anybody waits for a frame.
+    let mut arguments = ENDLESS;
+    arguments[10] = "1"; // --peer-timeout
+    let (supervisor, parts) = common::begin(&site, &arguments, 3);
+    let world = common::part(&parts, "world");
+    wait_until_stepping(world);
+    for _ in 0..3 {
+        let all = || parts.iter().map(|(_, id)| *id).chain([supervisor.id()]);
+        all().for_each(|id| send(id, Signal::STOP));
+        std::thread::sleep(Duration::from_secs(3));
+        all().for_each(|id| send(id, Signal::CONT));
+        let before = ticks(world);
+        wait_until("the world to step again", || ticks(world) >= before + 5);
+    }
+    supervisor.signal(Signal::INT);
+    supervisor.ended().expect(130, &["interrupted by SIGINT"]);
+    site.assert_clean();
+}
+
+#[test]
+fn nobody_is_started_again_and_again_for_a_world_that_is_stopped() {
+    let site = Site::new("stopped");
+    let mut arguments = ENDLESS;
+    arguments[10] = "1"; // --peer-timeout
+    arguments[12] = "on-failure"; // --restart
+    let (supervisor, parts) = common::begin(&site, &arguments, 3);
+    let world = common::part(&parts, "world");
+    wait_until_stepping(world);
+    send(world, Signal::STOP);
+    let ended = supervisor.ended();
+    ended.expect(
+        1,
+        &[&format!("the world (process {world}) is stopped and has made no step for "), "controller 0"],
+    );
+    assert!(!ended.err.contains("started again"), "{ended:?}");
+    assert!(!is_alive(world));
+    site.assert_clean();
+}
+
+#[test]
+fn files_cut_short_in_the_middle_of_a_run_hang_nobody() {
+    let site = Site::new("cut");
+    let mut arguments = ENDLESS;
+    arguments[10] = "2"; // --peer-timeout
+    arguments[12] = "on-failure"; // --restart
+    let (supervisor, parts) = common::begin(&site, &arguments, 3);
+    wait_until_stepping(common::part(&parts, "world"));
+    // Whatever there is, the marker of the run included.
+    for file in site.files().into_iter().filter(|path| path.is_file()) {
+        let _ = std::fs::OpenOptions::new().write(true).open(file).and_then(|file| file.set_len(0));
+    }
+    let ended = supervisor.ended();
+    ended.expect(1, &["world (process "]);
+    assert!(parts.iter().all(|(_, id)| !is_alive(*id)));
+    site.assert_clean();
+}
+
+#[test]
+fn a_failed_run_says_how_it_goes_on_from_its_recording() {
+    let site = Site::new("hint");
+    let folder = tempfile::tempdir().unwrap();
+    let recording = folder.path().join("r.czlog").display().to_string();
+    let (supervisor, parts) = common::begin(&site, &[&ENDLESS[..], &["--record", &recording]].concat(), 3);
+    let has_steps = || std::fs::metadata(&recording).is_ok_and(|file| file.len() > 100_000);
+    wait_until("steps to be recorded", has_steps);
+    send(common::part(&parts, "world"), Signal::KILL);
+    supervisor.ended().expect(1, &["was killed by signal 9", &format!("`cz resume {recording}` goes on")]);
+    site.assert_clean();
+}
+
+#[test]
+fn what_a_process_may_not_have_is_said() {
+    let limited = |limit: &str| {
+        let site = Site::new("limit");
+        let command = format!("ulimit {limit}; exec {} run --run {}", env!("CARGO_BIN_EXE_cz"), site.run());
+        let output = site.command("sh").args(["-c", &command]).output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(!said.contains("panicked") && output.status.code() == Some(1), "{limit}: {output:?}");
+        site.assert_clean();
+        said
+    };
+    let said = limited("-n 24");
+    assert!(said.contains("only 24 files may be open, see `ulimit -n`"), "{said}");
+    let said = limited("-v 30000");
+    assert!(said.contains("memory"), "{said}");
+    let folder = tempfile::tempdir().unwrap();
+    let deep = folder.path().join("d".repeat(130));
+    std::fs::create_dir(&deep).unwrap();
+    let output = Site::new("deep").command("cz").arg("run").env("XDG_RUNTIME_DIR", &deep).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(
+        output.status.code() == Some(1) && said.contains("set XDG_RUNTIME_DIR to a shorter one"),
+        "{said}"
+    );
+    assert!(!said.contains("panicked"), "{said}");
+}

@@ -251,3 +251,50 @@ fn a_participant_of_another_build_is_refused_with_both_hashes() {
     assert!(RunSpace::sweep(&run).unwrap(), "somebody is still in the run");
     assert_eq!(files(None, &name), Vec::<std::path::PathBuf>::new());
 }
+
+#[test]
+fn a_killed_world_can_be_started_again_while_somebody_waits_to_join() {
+    let site = Site::new("second");
+    // One joins, and waits for the coordinator; the other finds no place and goes; then the world is killed.
+    let world = site.start("cz-world", &["--ctrl-procs", "2", "--json", "-"]);
+    site.wait_until_settled();
+    // It cannot be answered while the world is stopped, so it waits to join when the world dies.
+    world.signal(Signal::STOP);
+    let waiting = site.start("cz-ctrl", &[]);
+    std::thread::sleep(Duration::from_millis(500));
+    world.signal(Signal::KILL);
+    assert!(world.ended().was_killed_by(Signal::KILL));
+    let mut parts = start(&site, site.run(), &[("cz-world", &["--json", "-"]), COORDINATOR]);
+    parts.push(waiting.ended());
+    assert_eq!(hash(&parts), expected());
+    site.assert_clean();
+}
+
+#[test]
+fn the_last_part_may_come_as_late_as_the_world_waits_for_it() {
+    let site = Site::new("last");
+    // A part that is ready waits for the others longer than for a frame.
+    let world = site.start("cz-world", &["--json", "-", "--peer-timeout", "1"]);
+    let controller = site.start("cz-ctrl", &["--peer-timeout", "1"]);
+    std::thread::sleep(Duration::from_secs(3));
+    let mut parts = start(&site, site.run(), &[COORDINATOR]);
+    parts.extend([world.ended(), controller.ended()]);
+    assert_eq!(hash(&parts), expected());
+    site.assert_clean();
+}
+
+#[test]
+fn a_name_that_looks_like_an_option_is_refused() {
+    let site = Site::new("dash");
+    for program in ["cz", "cz-world", "cz-ctrl"] {
+        let mut command = site.command(program);
+        if program == "cz" {
+            command.arg("run");
+        }
+        let output = command.arg("--run=-x").output().unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert_eq!(output.status.code(), Some(2), "{said}");
+        assert!(said.contains("not beginning with '-'"), "{said}");
+    }
+    site.assert_clean();
+}

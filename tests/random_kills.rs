@@ -16,6 +16,9 @@ use std::time::{Duration, Instant};
 /// Runs of the long test unless `CZ_RANDOM_KILLS` says how many; their seeds are `CZ_RANDOM_KILLS_FROM` (0) and on.
 const MANY: u64 = 1000;
 
+/// Longer than a run takes on a machine with much else to do.
+const VERY_LONG: Duration = Duration::from_secs(600);
+
 /// Scenarios, and the most processes per role each can use.
 const SCENARIOS: [(&str, &[&str], u32); 4] = [
     ("two-merges", &[], 2),
@@ -106,7 +109,7 @@ fn live(site: &Site, disturbance: &Disturbance, recording: &str) -> Course {
             killed.push(*victim);
         }
     }
-    Course { killed, ended: supervisor.ended() }
+    Course { killed, ended: supervisor.ended_within(VERY_LONG) }
 }
 
 /// What was wrong with a run, if anything was.
@@ -173,7 +176,8 @@ fn random_kills(seeds: std::ops::Range<u64>) {
             common::hash(&Site::new("u").summary(&[&[*scenario, "--in-process"], *settings].concat())),
         );
         let start = Instant::now();
-        Site::new("u").summary(&[&[*scenario], *settings].concat());
+        let run = Site::new("u").start("cz", &[&[*scenario, "--wait", "block"], *settings].concat());
+        run.ended_within(VERY_LONG).expect(0, &[]);
         length.push(start.elapsed());
     }
     let (mut verdicts, mut wrong) = (HashMap::<_, u32>::new(), Vec::new());

@@ -5,7 +5,7 @@ use super::args::{
 };
 use super::record::Recording;
 use super::run::own_name;
-use super::supervise::{Plan, conduct};
+use super::supervise::{self, Plan};
 use super::{AppError, print};
 use crate::bench::{
     self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport, Sumo,
@@ -111,7 +111,7 @@ pub(super) fn run_as(
         None => None,
     };
     let mut outcome = None;
-    conduct(&plan, recording, None, |result| {
+    supervise::conduct(&plan, recording, None, |result| {
         outcome = Some(result);
         Ok(())
     })

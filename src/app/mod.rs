@@ -107,6 +107,7 @@ fn panic_line(program: &str, what: &str, at: &str) -> String {
 /// `cz`.
 pub fn cz() -> ExitCode {
     say_panics_in_a_line("cz");
+    raise_file_limit();
     let args = args::Cz::parse();
     finish(
         "cz",
@@ -134,19 +135,29 @@ pub fn cz() -> ExitCode {
 /// `cz-world`, the same as `cz world`.
 pub fn cz_world() -> ExitCode {
     say_panics_in_a_line("cz-world");
+    raise_file_limit();
     finish("cz-world", parts::world(&args::Standalone::<args::WorldArgs>::parse().args))
 }
 
 /// `cz-coord`, the same as `cz coord`.
 pub fn cz_coord() -> ExitCode {
     say_panics_in_a_line("cz-coord");
+    raise_file_limit();
     finish("cz-coord", parts::coordinator(&args::Standalone::<args::PartArgs>::parse().args))
 }
 
 /// `cz-ctrl`, the same as `cz ctrl`.
 pub fn cz_ctrl() -> ExitCode {
     say_panics_in_a_line("cz-ctrl");
+    raise_file_limit();
     finish("cz-ctrl", parts::controller(&args::Standalone::<args::PartArgs>::parse().args))
+}
+
+/// Lets this process open as many files as it may: a run with many processes needs more than the usual first bound.
+fn raise_file_limit() {
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+    let limit = getrlimit(Resource::Nofile);
+    let _ = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit });
 }
 
 fn finish(program: &str, result: Result<(), AppError>) -> ExitCode {
@@ -171,15 +182,6 @@ impl AppError {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    #[test]
-    fn a_panic_is_said_in_one_line() {
-        let line = super::panic_line("cz", "a \"b\"\nc", "src/x.rs:1:2");
-        assert_eq!(line, "cz: internal error, please report it: a \"b\"\\nc (at src/x.rs:1:2)");
-    }
-}
-
 /// Writes to stdout; a reader that has gone away is no reason to panic.
 fn print(text: &str) -> Result<(), AppError> {
     use std::io::{ErrorKind, Write};
@@ -189,5 +191,14 @@ fn print(text: &str) -> Result<(), AppError> {
             Err(AppError::Failed(format!("cannot write to stdout: {e}")))
         }
         _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn a_panic_is_said_in_one_line() {
+        let line = super::panic_line("cz", "a \"b\"\nc", "src/x.rs:1:2");
+        assert_eq!(line, "cz: internal error, please report it: a \"b\"\\nc (at src/x.rs:1:2)");
     }
 }

@@ -69,10 +69,10 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         let outcome = run_world(&scenario, &options, past, &settling, &stop, |world| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
-                report(&WorldLine::progress(world));
+                tell_supervisor(&WorldLine::progress(world));
             }
         })?;
-        report(&WorldLine::Outcome(Box::new(outcome)));
+        tell_supervisor(&WorldLine::Outcome(Box::new(outcome)));
         return Ok(());
     }
     let outcome = run_world(&scenario, &options, past, &settling, &stop, |_: &World| {});
@@ -148,7 +148,7 @@ pub(super) fn follow_supervisor(supervisor: Option<u32>) -> Result<(), AppError>
 }
 
 /// One line of JSON to the supervisor; if it has gone, a signal is under way.
-fn report(line: &WorldLine) {
+fn tell_supervisor(line: &WorldLine) {
     let mut out = std::io::stdout().lock();
     let _ = serde_json::to_writer(&mut out, line);
     let _ = out.write_all(b"\n").and_then(|()| out.flush());

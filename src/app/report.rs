@@ -112,7 +112,7 @@ impl Summary {
     /// Prints the table, or writes the JSON, or both; what nobody should miss goes to stderr as well.
     pub fn deliver(&self, json: Option<&Path>) -> Result<(), AppError> {
         let results = self.deliver_results(json);
-        self.warnings().iter().for_each(|warning| eprintln!("cz: warning: {warning}"));
+        self.warnings().iter().for_each(|warning| super::say::say(format_args!("cz: warning: {warning}")));
         results
     }
 

@@ -6,6 +6,7 @@ use super::seating::{Judgement, Seating};
 use super::{Peer, Peers, ProcessError, StopFlag, WaitMode};
 use crate::encoding;
 use crate::lockstep::{Handover, Seat};
+use crate::own_time::Bound;
 use crate::scenario::{Drivers, Scenario, decode, scenario_hash};
 use crate::transport::TransportError;
 use crate::transport::iox::{AttachDesk, AttachLine, Bells, RunName, RunSpace, SpaceError};
@@ -54,16 +55,9 @@ impl Attachment {
         joining: Joining,
         stop: &StopFlag,
     ) -> Result<Attachment, ProcessError> {
-        let deadline = Instant::now() + joining.timeout;
+        let mut bound = Bound::of(joining.timeout);
         let no_world =
             || ProcessError::NoWorld { run: run.to_string(), seconds: joining.timeout.as_secs_f64() };
-        let line = loop {
-            match space.open_attach_line() {
-                Ok(line) => break line,
-                Err(SpaceError::NoService { .. }) => pause(deadline, stop, &no_world)?,
-                Err(error) => return Err(error.into()),
-            }
-        };
         let mut instance = [0u8; 8];
         // The instance only tells simultaneous joiners apart; the time will do where there is no entropy.
         if rustix::rand::getrandom(&mut instance, rustix::rand::GetRandomFlags::NONBLOCK).is_err() {
@@ -80,7 +74,21 @@ impl Attachment {
             phase: frames::ATTACH_JOIN,
             index: 0,
         };
-        let (reply, bytes) = exchange(&line, request, deadline, stop, &no_world)?;
+        let (line, (reply, bytes)) = loop {
+            let world = space.world().filter(|world| is_alive(*world));
+            let line = match world.map(|_| space.open_attach_line()) {
+                None | Some(Err(SpaceError::NoService { .. })) => {
+                    pause(&mut bound, stop, &no_world)?;
+                    continue;
+                }
+                Some(line) => line?,
+            };
+            // What a dead world has left is let go, so that another one can take its place.
+            let still_there = || space.world() == world && world.is_some_and(is_alive);
+            if let Some(answer) = exchange(&line, request, &mut bound, stop, &no_world, &still_there)? {
+                break (line, answer);
+            }
+        };
         if reply.status != frames::ATTACH_ACCEPTED {
             let reason = String::from_utf8_lossy(&bytes).into_owned();
             return Err(ProcessError::Refused { run: run.to_string(), role: joining.role, reason });
@@ -105,10 +113,17 @@ impl Attachment {
         let request = AttachRequest { phase, index: self.reply.index, ..self.request };
         let seconds = self.joining.timeout.as_secs_f64();
         let no_world = || ProcessError::NoWorld { run: self.run.to_string(), seconds };
-        let deadline = Instant::now() + self.joining.timeout;
+        let mut bound = Bound::of(self.joining.timeout);
         // What earlier requests may still have brought is of the past.
         while self.line.next_reply()?.is_some() {}
-        let (reply, bytes) = exchange(&self.line, request, deadline, stop, &no_world)?;
+        let world = self.world();
+        let still_there = || world.first_gone().is_none();
+        let Some((reply, bytes)) = exchange(&self.line, request, &mut bound, stop, &no_world, &still_there)?
+        else {
+            let consequence = "this one was waiting for its answer".to_owned();
+            let peer = world.0[0];
+            return Err(ProcessError::PeerGone { peer, name: peer.to_string(), consequence });
+        };
         if reply.status != frames::ATTACH_ACCEPTED {
             let reason = String::from_utf8_lossy(&bytes).into_owned();
             return Err(ProcessError::Refused { run: self.run.to_string(), role: self.joining.role, reason });
@@ -122,44 +137,48 @@ impl Attachment {
     }
 }
 
-/// Repeats a request until its reply comes.
+/// Repeats a request until its reply comes; nothing does any more when the world is no longer there.
 fn exchange(
     line: &AttachLine,
     request: AttachRequest,
-    deadline: Instant,
+    bound: &mut Bound,
     stop: &StopFlag,
     too_late: &dyn Fn() -> ProcessError,
-) -> Result<(AttachReply, Vec<u8>), ProcessError> {
+    still_there: &dyn Fn() -> bool,
+) -> Result<Option<(AttachReply, Vec<u8>)>, ProcessError> {
     let mut repeat_at = Instant::now();
     let patient_until = Instant::now() + LOOK;
     loop {
         if Instant::now() >= repeat_at {
+            if !still_there() {
+                return Ok(None);
+            }
             line.request(request)?;
             repeat_at = Instant::now() + REPEAT;
         }
         while let Some(frame) = line.next_reply()? {
             if frame.reply().instance == request.instance {
-                return Ok((*frame.reply(), frame.scenario().to_vec()));
+                return Ok(Some((*frame.reply(), frame.scenario().to_vec())));
             }
         }
         if Instant::now() < patient_until {
             // Once the run is under way, the world answers at once.
             std::thread::yield_now();
         } else {
-            pause(deadline, stop, too_late)?;
+            pause(bound, stop, too_late)?;
         }
     }
 }
 
 fn pause(
-    deadline: Instant,
+    bound: &mut Bound,
     stop: &StopFlag,
     too_late: &dyn Fn() -> ProcessError,
 ) -> Result<(), ProcessError> {
     if stop.is_set() {
         return Err(ProcessError::Interrupted { step: None });
     }
-    if Instant::now() >= deadline {
+    if bound.is_over() {
         return Err(too_late());
     }
     std::thread::sleep(LOOK);

@@ -29,6 +29,8 @@ pub fn run_coordinator(
     refused: &dyn Fn(RefusedFrames),
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
+    // The others may come as late as the world waits for them; whoever stops waiting first is not to be this one.
+    let until_begun = joining.timeout + peer_timeout;
     let space = RunSpace::enter(run)?;
     let attachment = Attachment::join(&space, run, joining, stop)?;
     let AttachReply { index, coordinators, controllers, .. } = attachment.reply;
@@ -70,7 +72,7 @@ pub fn run_coordinator(
     // Declared last, so let go first.
     let _held = held;
     let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
-    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world());
+    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world()).begin_within(until_begun);
     let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
     driver.refused().into_iter().for_each(refused);
     end
@@ -86,6 +88,8 @@ pub fn run_controller(
     refused: &dyn Fn(RefusedFrames),
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
+    // The others may come as late as the world waits for them; whoever stops waiting first is not to be this one.
+    let until_begun = joining.timeout + peer_timeout;
     let space = RunSpace::enter(run)?;
     let attachment = Attachment::join(&space, run, joining, stop)?;
     let AttachReply { index, coordinators, controllers, first_step, .. } = attachment.reply;
@@ -115,7 +119,7 @@ pub fn run_controller(
     // Declared last, so let go first.
     let _held = held;
     let patience = Patience::of(wait, Role::Controller, 1 + controllers as usize, peer_timeout);
-    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world());
+    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world()).begin_within(until_begun);
     let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
     driver.refused().into_iter().for_each(refused);
     end

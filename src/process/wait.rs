@@ -5,6 +5,7 @@ use super::realtime::{Breather, is_fifo};
 use super::wait_policy::{Advice, Situation, WaitPolicy};
 use super::{Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
+use crate::own_time::LONGEST_PAUSE;
 use crate::scenario::ControllerNames;
 use crate::transport::iox::{Bell, monotonic_ns};
 use ipc_schemas::{Role, WAITING_ADAPTIVE, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
@@ -163,7 +164,10 @@ pub struct Waiter {
     peers: Peers,
     names: ControllerNames,
     polls: u64,
+    /// When the clock was looked at last.
     since: Option<u64>,
+    /// The bound of the first wait, where it is another.
+    first: Option<Duration>,
     waited: Duration,
     peers_checked: Duration,
     /// There is one when the process would keep others from running.
@@ -190,10 +194,17 @@ impl Waiter {
             names: ControllerNames::default(),
             polls: 0,
             since: None,
+            first: None,
             waited: Duration::ZERO,
             peers_checked: Duration::ZERO,
             breather: Breather::if_needed(),
         }
+    }
+
+    /// Has the first wait be bounded so.
+    pub fn begin_within(mut self, bound: Duration) -> Waiter {
+        self.first = Some(bound);
+        self
     }
 
     /// Something came.
@@ -201,6 +212,7 @@ impl Waiter {
         if let Some(breather) = &mut self.breather {
             breather.breathe();
         }
+        self.first = None;
         if std::mem::take(&mut self.polls) == 0 {
             return;
         }
@@ -283,10 +295,12 @@ impl Waiter {
             breather.breathe();
         }
         let now = monotonic_ns();
-        self.waited = Duration::from_nanos(now - *self.since.get_or_insert(now));
-        if self.waited >= self.patience.timeout {
+        let last = self.since.replace(now).unwrap_or(now);
+        self.waited += Duration::from_nanos(now.saturating_sub(last)).min(LONGEST_PAUSE);
+        let timeout = self.first.unwrap_or(self.patience.timeout);
+        if self.waited >= timeout {
             let awaited = awaited.named(&self.names);
-            return Err(ProcessError::Timeout { awaited, seconds: self.patience.timeout.as_secs_f64() });
+            return Err(ProcessError::Timeout { awaited, seconds: timeout.as_secs_f64() });
         }
         if self.waited >= self.peers_checked + PEER_CHECK {
             self.peers_checked = self.waited;

@@ -5,11 +5,13 @@ use super::house::House;
 use super::observe::{self, ObservedSteps};
 use super::outcome::{History, Outcome, StepMeter};
 use super::pace::Pacer;
+use super::peers::is_alive;
 use super::placement::number_of_cores;
 use super::services::{Services, expected_vehicles};
 use super::{Pace, Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Handover, Ledger, Progress, Seat, WorldDriver};
+use crate::own_time::Bound;
 use crate::record::{FileSource, Reader, ReplayError, replay_world};
 use crate::scenario::Scenario;
 use crate::step::StepFrames;
@@ -17,7 +19,7 @@ use crate::transport::iox::{RunName, RunSpace, SpaceError};
 use crate::world::World;
 use ipc_schemas::Role;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// How a world process is to run.
 #[derive(Clone, Debug)]
@@ -54,6 +56,8 @@ impl WorldOptions {
     }
 }
 
+/// How long whoever knew a killed world may take to let its services go.
+const LETTING_GO: Duration = Duration::from_secs(3);
 /// Steps between two looks at the signal flag and the clock for progress.
 const STEPS_PER_LOOK: u64 = 64;
 
@@ -111,18 +115,22 @@ pub fn run_world(
     let held = settling.settle(Role::World, 0, wait, wait.hot_processes(coordinators, controllers));
     let space = RunSpace::enter(&options.run)?;
     let run_id = options.run_id.unwrap_or_else(new_run_id);
-    let active = |error| match error {
-        SpaceError::Exists { .. } => ProcessError::AlreadyActive { run: options.run.to_string() },
-        other => other.into(),
-    };
+    if space.world().is_some_and(is_alive) {
+        return Err(ProcessError::AlreadyActive { run: options.run.to_string() });
+    }
+    space.forget_world();
+    space.check_room()?;
     // The desk last: once it exists, everything else does.
-    let services =
-        Services::create(&space, scenario, (coordinators, controllers), ledger.is_some()).map_err(active)?;
+    let services = create(&space, &options.run, stop, || {
+        Services::create(&space, scenario, (coordinators, controllers), ledger.is_some())
+    })?;
     let observed = match options.observed {
         true => {
             // Less than others wait for the world, so that it is the world that says what it waited for.
             let lag = (options.record_lag, options.peer_timeout.mul_f64(0.9));
-            Some(observe::create(&space, expected_vehicles(scenario), scenario, lag, stop).map_err(active)?)
+            Some(create(&space, &options.run, stop, || {
+                observe::create(&space, expected_vehicles(scenario), scenario, lag, stop)
+            })?)
         }
         false => None,
     };
@@ -130,8 +138,10 @@ pub fn run_world(
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
     let bell = rung.then(|| bells.bell(Role::World, 0));
-    let mut reception =
-        Reception::open(&space, scenario, run_id, (coordinators, controllers), wait).map_err(active)?;
+    let mut reception = create(&space, &options.run, stop, || {
+        Reception::open(&space, scenario, run_id, (coordinators, controllers), wait)
+    })?;
+    space.announce_world()?;
     reception.first_step = first_step;
     let handed = |role, index| {
         let ledger = ledger.as_ref().filter(|_| resume.is_some())?;
@@ -139,6 +149,7 @@ pub fn run_world(
     };
     receive_all(&mut reception, &handed, observed.as_ref(), options, stop)?;
     let ports = services.world_ports(&bells, scenario, wait)?;
+    space.check_room()?;
 
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
     driver.keep(ledger);
@@ -261,6 +272,29 @@ fn drive(
     Ok(meter.outcome(run.world(), History::default()))
 }
 
+/// Creates something of the run. What a world that was killed has created is in the way until whoever knew it has
+/// let it go, which takes a moment.
+fn create<T>(
+    space: &RunSpace,
+    run: &RunName,
+    stop: &StopFlag,
+    attempt: impl Fn() -> Result<T, SpaceError>,
+) -> Result<T, ProcessError> {
+    let mut bound = Bound::of(LETTING_GO);
+    loop {
+        match attempt() {
+            Err(SpaceError::Exists { .. }) if bound.is_over() || stop.is_set() => {
+                return Err(ProcessError::AlreadyActive { run: run.to_string() });
+            }
+            Err(SpaceError::Exists { .. }) => {
+                space.sweep_dead();
+                std::thread::sleep(Duration::from_millis(10));
+            }
+            result => return Ok(result?),
+        }
+    }
+}
+
 /// Waits until all participants are ready.
 fn receive_all(
     reception: &mut Reception,
@@ -269,7 +303,7 @@ fn receive_all(
     options: &WorldOptions,
     stop: &StopFlag,
 ) -> Result<(), ProcessError> {
-    let deadline = Instant::now() + options.attach_timeout;
+    let mut bound = Bound::of(options.attach_timeout);
     loop {
         reception.serve(&mut |role, index, _| match handed(role, index as usize) {
             Some(handover) => Readiness::Now(Box::new(handover)),
@@ -283,7 +317,7 @@ fn receive_all(
         if stop.is_set() {
             return Err(ProcessError::Interrupted { step: None });
         }
-        if Instant::now() >= deadline {
+        if bound.is_over() {
             let Some((role, index)) = missing else {
                 return Err(ProcessError::NotObserved { seconds: options.attach_timeout.as_secs_f64() });
             };

@@ -9,6 +9,7 @@ use crate::app::lines::PartLine;
 use crate::app::parts::follow_supervisor;
 use crate::app::say::say;
 use crate::process::children_of;
+use crate::transport::iox::RunSpace;
 use rustix::io::Errno;
 use rustix::process::{
     Pid, Resource, Rlimit, Signal, WaitOptions, WaitStatus, getpid, kill_process_group, set_child_subreaper,
@@ -46,6 +47,10 @@ pub(in crate::app) fn keep(args: &KeepArgs) -> Result<(), AppError> {
     let mut is_ending = false;
     loop {
         if !reap_all(group, &mut status) {
+            if is_ending && let Some(run) = std::env::var("CZ_RUN").ok().and_then(|run| run.parse().ok()) {
+                // Who was killed has removed nothing, and its supervisor may be dead.
+                let _ = RunSpace::sweep(&run);
+            }
             end_like(status);
         }
         let has_failed = status.is_some_and(|status| status.exit_status() != Some(0));

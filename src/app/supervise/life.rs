@@ -2,7 +2,7 @@
 //!
 //! A run goes on until its results are in or something has gone wrong. Results that are in are never lost again:
 //! whatever its processes do afterwards is a note. Time is what the supervisor has lived through (see
-//! [`OwnTime`](crate::process::OwnTime)).
+//! [`OwnTime`](crate::own_time::OwnTime)).
 
 use std::time::Duration;
 
@@ -164,7 +164,10 @@ impl Life {
     pub fn did_not_start(&mut self, member: usize, why: &str, now: Now) {
         let member = &mut self.members[member];
         member.process = Process::Ended;
-        let text = format!("cannot start {}: {why}", member.name);
+        let text = format!(
+            "cannot start {}: {why}; memory or processes may be limited, see `ulimit -a`",
+            member.name
+        );
         self.fail(Failure::Failed(text), now);
     }
 
@@ -468,7 +471,13 @@ fn describe(member: &Member, id: u32, end: &End) -> String {
     let how = match end {
         End::Code(0) => "left with code 0".to_owned(),
         End::Code(code) => format!("ended with code {code}"),
-        End::Signal(signal, name) => format!("was killed by signal {signal} ({name})"),
+        End::Signal(signal, name) => {
+            let why = match *name {
+                "SIGBUS" => "; /dev/shm is full, or another process has cut files in it short",
+                _ => "",
+            };
+            format!("was killed by signal {signal} ({name}){why}")
+        }
         End::Unknown(why) => format!("could not be waited for: {why}"),
     };
     let name = &member.name;

@@ -6,19 +6,18 @@ mod child;
 mod keep;
 mod life;
 
-use super::{AppError, record};
 use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs};
 use super::lines::{PartLine, WorldLine};
 use super::record::Recording;
 use super::run::{Bar, Position};
 use super::say::Crier;
+use super::{AppError, record};
 use crate::lockstep::RefusedFrames;
-use crate::process::{
-    Observation, Outcome, OwnTime, ProcessError, Settled, children_of, is_stopped, signals_to_heed,
-};
+use crate::own_time::OwnTime;
+use crate::process::{Observation, Outcome, ProcessError, Settled, children_of, is_stopped, signals_to_heed};
 use crate::record::Reader;
 use crate::scenario::Plugin;
-use crate::transport::iox::{RunName, RunSpace};
+use crate::transport::iox::{RunName, RunSpace, clean};
 use child::{Event, Stdout};
 use crossbeam::channel::{Receiver, Sender, bounded, select, unbounded};
 pub(super) use keep::keep;
@@ -97,6 +96,10 @@ pub(super) fn conduct(
         family.close();
         // Whoever is still alive in the space keeps it; then there is nothing to be swept.
         let _ = RunSpace::sweep(&plan.run);
+        if outcome.is_err() {
+            // What cannot be known by a marker that was written over is known by its lock.
+            let _ = clean(false);
+        }
     }
     outcome.map_err(|error| point_to(path, error)).and(delivered).and(recorded)
 }
@@ -160,7 +163,8 @@ impl Family {
         let (signal_sender, signals) = unbounded();
         let mut source = signal_hook::iterator::Signals::new(signals_to_heed())
             .map_err(|e| failed("cannot handle signals", &e))?;
-        let no_thread = |e| failed("cannot start a thread", &e);
+        let no_thread =
+            |e| failed("cannot start a thread (memory or processes may be limited, see `ulimit -a`)", &e);
         std::thread::Builder::new()
             .name("signals".to_owned())
             .spawn(move || {

@@ -105,10 +105,12 @@ pub(super) fn read(
     Ok(Topology { zones, declared, road_ends })
 }
 
+/// Zone, approach, and the link's length and speed.
+type ExitClaim = (u32, u32, (f64, f64));
+
 /// Who uses which exit and which road, by indices as declared.
 struct Claims<'a> {
-    /// Zone, approach, and the link's length and speed.
-    exits: Vec<Option<(u32, u32, (f64, f64))>>,
+    exits: Vec<Option<ExitClaim>>,
     /// The `zone` key that claimed each exit, for messages.
     exit_fields: Vec<Option<Field<'a>>>,
     /// Zone, approach, and the key path that claimed it.

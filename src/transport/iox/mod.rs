@@ -6,6 +6,7 @@ mod leftovers;
 mod place;
 mod ports;
 mod space;
+mod watchdog;
 
 pub use bell::{Bell, BellRope, Bells, monotonic_ns};
 pub use blocks::{Block, BlockInbox, BlockOutbox};

@@ -24,6 +24,8 @@ use std::time::{Duration, Instant};
 
 /// The file in a run's directory by which it is known, eight hexadecimal digits long: the instance.
 const MARKER: &str = ".cz-run";
+/// The instance of a run whose marker somebody has written over: it is ours to remove, and has no shared memory.
+const DAMAGED: &str = "damaged";
 /// A run's directory before its marker is in it; there is one at most, under the lock.
 const BEGINNING: &str = ".cz-begins";
 /// Where shared memory has its files.
@@ -284,7 +286,8 @@ fn marker(directory: &OwnedFd) -> Option<(OwnedFd, String)> {
     let mut instance = String::new();
     let mut file = File::from(marker);
     (&mut file).take(9).read_to_string(&mut instance).ok()?;
-    is_instance(&instance).then(|| (file.into(), instance))
+    let instance = if is_instance(&instance) { instance } else { DAMAGED.to_owned() };
+    Some((file.into(), instance))
 }
 
 fn is_instance(text: &str) -> bool {

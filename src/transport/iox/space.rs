@@ -7,6 +7,7 @@ use super::bell::BellRope;
 use super::leftovers::sweep_dead_runs;
 use super::place::{Base, Found, Place, Presence, SHARED_MEMORY, shared_memory};
 use super::ports::{Factory, IoxInbox, IoxOutbox};
+use super::watchdog::within_bounds;
 use crate::transport::TransportError;
 use iceoryx2::config::Config;
 use iceoryx2::port::BackpressureAction;
@@ -22,17 +23,22 @@ use iceoryx2::service::ipc;
 use ipc_schemas::{
     AttachReply, AttachRequest, FrameHeader, Record, Role, SERVICE_ATTACH, SERVICE_ATTACH_REPLY,
 };
+use rustix::fs::statvfs;
+use rustix::io::Errno;
+use rustix::process::{Resource, getrlimit};
+use std::io::Write;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
 use std::str::FromStr;
 
-/// A valid run name: 1 to 32 characters of `[A-Za-z0-9_-]`.
+/// A valid run name: 1 to 32 characters of `[A-Za-z0-9_-]`, the first no dash, by which options begin.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunName(String);
 
 /// Not a run name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{name:?} is not a run name; expected 1 to 32 letters, digits, '-' or '_'")]
+#[error("{name:?} is not a run name; expected 1 to 32 letters, digits, '-' or '_', not beginning with '-'")]
 pub struct RunNameError {
     /// What was given.
     pub name: String,
@@ -43,6 +49,7 @@ impl FromStr for RunName {
 
     fn from_str(name: &str) -> Result<RunName, RunNameError> {
         let valid = (1..=32).contains(&name.len())
+            && !name.starts_with('-')
             && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
         if valid { Ok(RunName(name.to_owned())) } else { Err(RunNameError { name: name.to_owned() }) }
     }
@@ -85,6 +92,14 @@ pub enum SpaceError {
         /// What is wrong with it.
         problem: String,
     },
+    /// Shared memory is full, or nearly.
+    #[error("{SHARED_MEMORY} has {free} of free memory; the run needs {needed}")]
+    NoRoom {
+        /// What is left.
+        free: String,
+        /// What may be needed.
+        needed: String,
+    },
     /// iceoryx2 or the file system failed.
     #[error("{what}: {reason}")]
     Failed {
@@ -95,8 +110,15 @@ pub enum SpaceError {
     },
 }
 
+/// With fewer files than this a process of a run may not get by.
+const FEW_FILES: u64 = 256;
+
 pub(super) fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
-    SpaceError::Failed { what: what.to_owned(), reason: format!("{reason:?}") }
+    // iceoryx2 does not tell for want of what it failed.
+    let few = getrlimit(Resource::Nofile).current.filter(|most| *most < FEW_FILES);
+    let hint =
+        few.map(|most| format!("; only {most} files may be open, see `ulimit -n`")).unwrap_or_default();
+    SpaceError::Failed { what: what.to_owned(), reason: format!("{reason:?}{hint}") }
 }
 
 /// How many ports of a service there may be. Each send walks all subscriber slots, so these are tight.
@@ -153,8 +175,16 @@ pub struct RunSpace {
     run: RunName,
     /// Where the run's bells are.
     pub(super) bells_path: PathBuf,
+    prefix: String,
 }
 
+/// The file in shared memory that names a run's world, and the same while it is written.
+const WORLD: &str = "world";
+const WORLD_BEGINNING: &str = "world.begins";
+/// Of the 255 characters iceoryx2 allows a path, what its longest file names leave for directory and prefix.
+const LONGEST_PATH: usize = 136;
+/// Room in shared memory below which no run is begun, bytes.
+const LEAST_ROOM: u64 = 1 << 20;
 /// Frames in flight per connection: in lockstep one is being read while the next arrives.
 const BUFFER: usize = 2;
 /// Frames of one sender a receiver may hold: the world keeps those of this step and of the one before, and
@@ -179,23 +209,52 @@ impl RunSpace {
             Found::Foreign(problem) => return Err(foreign(&base, run, &problem)),
         };
         let presence = Some(place.enter()?);
-        let node = NodeBuilder::new()
-            .config(&config(&place)?)
-            .signal_handling_mode(SignalHandlingMode::Disabled)
-            .create::<ipc::Service>()
-            .map_err(|e| failed("create a node", &e))?;
-        close_to_others(&place.prefix);
-        node.try_cleanup_dead_nodes();
+        let config = config(&place)?;
+        let node = within_bounds(&format!("coming into run {run}"), || {
+            let node = NodeBuilder::new()
+                .config(&config)
+                .signal_handling_mode(SignalHandlingMode::Disabled)
+                .create::<ipc::Service>()
+                .map_err(|e| failed("create a node", &e))?;
+            close_to_others(&place.prefix);
+            node.try_cleanup_dead_nodes();
+            Ok(node)
+        })?;
         drop(base);
         if begins {
             sweep_dead_runs();
         }
         let bells_path = Path::new(SHARED_MEMORY).join(format!("{}bells", place.prefix));
-        Ok(RunSpace { node: Some(node), presence, run: run.clone(), bells_path })
+        Ok(RunSpace { node: Some(node), presence, run: run.clone(), bells_path, prefix: place.prefix })
     }
 
     pub(super) fn node(&self) -> &Node<ipc::Service> {
         self.node.as_ref().expect("the node is only taken when the space is dropped")
+    }
+
+    /// The process that has said last that it is the run's world, which may be gone.
+    pub fn world(&self) -> Option<u32> {
+        std::fs::read_to_string(self.file(WORLD)).ok()?.parse().ok()
+    }
+
+    /// Says that this process is the run's world and has created its services.
+    pub fn announce_world(&self) -> Result<(), SpaceError> {
+        let (path, beginning) = (self.file(WORLD), self.file(WORLD_BEGINNING));
+        // Complete when it appears under its name.
+        let open =
+            std::fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&beginning);
+        open.and_then(|mut file| file.write_all(std::process::id().to_string().as_bytes()))
+            .and_then(|()| std::fs::rename(&beginning, &path))
+            .map_err(|e| failed(&format!("write {}", path.display()), &e))
+    }
+
+    /// Takes down what a world that is gone has said.
+    pub fn forget_world(&self) {
+        let _ = std::fs::remove_file(self.file(WORLD));
+    }
+
+    fn file(&self, name: &str) -> PathBuf {
+        Path::new(SHARED_MEMORY).join(format!("{}{name}", self.prefix))
     }
 
     /// Creates a service as the run's world.
@@ -219,13 +278,10 @@ impl RunSpace {
 
     /// Opens a service the world has created.
     pub fn open<R: Record>(&self, name: &str) -> Result<Service<R>, SpaceError> {
-        let factory = self
-            .node()
-            .service_builder(&service_name(name)?)
-            .publish_subscribe::<[R]>()
-            .user_header::<FrameHeader>()
-            .open()
-            .map_err(|e| open_error(name, e))?;
+        let builder = self.node().service_builder(&service_name(name)?);
+        let builder = builder.publish_subscribe::<[R]>().user_header::<FrameHeader>();
+        let factory =
+            within_bounds(&format!("opening {name}"), || builder.open()).map_err(|e| open_error(name, e))?;
         Ok(Service { name: name.to_owned(), factory: Rc::new(factory) })
     }
 
@@ -275,6 +331,10 @@ impl RunSpace {
 
     /// Opens a participant's side of attaching.
     pub fn open_attach_line(&self) -> Result<AttachLine, SpaceError> {
+        within_bounds("asking the world for a place", || self.attach_line())
+    }
+
+    fn attach_line(&self) -> Result<AttachLine, SpaceError> {
         let requests = self
             .node()
             .service_builder(&service_name(SERVICE_ATTACH)?)
@@ -303,7 +363,26 @@ impl RunSpace {
 
     /// Removes what processes killed in this run have left, while others go on.
     pub fn sweep_dead(&self) {
-        self.node().try_cleanup_dead_nodes();
+        within_bounds("removing what dead processes have left", || self.node().try_cleanup_dead_nodes());
+    }
+
+    /// Says so when shared memory has no room for what the run's files may grow to: whoever writes where there
+    /// is none is killed.
+    pub fn check_room(&self) -> Result<(), SpaceError> {
+        let wrong = |e: Errno| failed(&format!("look at {SHARED_MEMORY}"), &e);
+        let memory = statvfs(SHARED_MEMORY).map_err(wrong)?;
+        let free = memory.f_bavail * memory.f_frsize;
+        let needed: u64 = shared_memory(&self.prefix)
+            .iter()
+            .filter_map(|path| std::fs::metadata(path).ok())
+            .map(|file| file.len().saturating_sub(file.blocks() * 512))
+            .sum::<u64>()
+            .max(LEAST_ROOM);
+        if free >= needed {
+            return Ok(());
+        }
+        let mib = |bytes: u64| format!("{:.1} MiB", bytes as f64 / f64::from(1 << 20));
+        Err(SpaceError::NoRoom { free: mib(free), needed: mib(needed) })
     }
 
     /// Removes everything a run has left when none of its processes lives any more; does nothing
@@ -349,6 +428,14 @@ fn close_to_others(prefix: &str) {
 fn config(place: &Place) -> Result<Config, SpaceError> {
     let mut config = Config::default();
     let path = place.directory.to_string_lossy();
+    let (length, most) = (path.len(), LONGEST_PATH.saturating_sub(place.prefix.len()));
+    if length > most {
+        // iceoryx2 panics when it forms the path of a connection.
+        let problem = format!(
+            "{length} characters are too many for the paths of files in it, expected at most {most}; set XDG_RUNTIME_DIR to a shorter one"
+        );
+        return Err(SpaceError::NotOurs { path: place.directory.clone(), problem });
+    }
     let path = iceoryx2::prelude::Path::new(path.as_bytes())
         .map_err(|e| failed(&format!("use the directory {path}"), &e))?;
     config.global.set_root_path(&path);

@@ -4,7 +4,7 @@
 use std::time::{Duration, Instant};
 
 /// The longest pause between two looks that counts in full, where whoever looks says nothing else.
-pub(super) const LONGEST_PAUSE: Duration = Duration::from_millis(250);
+pub(crate) const LONGEST_PAUSE: Duration = Duration::from_millis(250);
 
 /// A clock that stands still while its process does not run: it must be looked at, and counts no more of the time
 /// between two looks than a running process could have let pass.
