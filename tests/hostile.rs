@@ -5,11 +5,14 @@
 mod common;
 
 use common::{Site, files, unique_name, wait_until};
-use control_zones::transport::iox::{RunName, RunSpace};
-use control_zones::transport::{Loan, Outbox};
+use control_zones::record::Step;
+use control_zones::transport::iox::{BlockInbox, IoxOutbox, RunName, RunSpace};
+use control_zones::transport::{Loan, Outbox, Slots};
 use ipc_schemas::{
     ANY_INDEX, ATTACH_BAD_PHASE, ATTACH_JOIN, ATTACH_NO_CONTROLLER, ATTACH_NO_ROOM, ATTACH_READY, Assignment,
-    AttachRequest, FrameHeader, Role, SERVICE_COMMAND, SERVICE_COORDINATION, VehicleCommand, schema_hash,
+    AttachRequest, FrameHeader, Member, Record, Role, SERVICE_COMMAND, SERVICE_COORDINATION,
+    SERVICE_COORDINATOR_STATE_PREFIX, SERVICE_MEMBERS, SERVICE_OBSERVER, SERVICE_STATE,
+    SERVICE_SUMMARY_PREFIX, VehicleCommand, VehicleState, ZoneSummary, schema_hash,
 };
 use rustix::process::Signal;
 use std::process::{Child, Command, Stdio};
@@ -248,4 +251,147 @@ fn attach_requests_that_contradict_themselves_are_refused_and_end_nothing() {
     let said = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && said.contains("4bd61fbe17f858e7"), "{said}");
     assert!(parts.iter_mut().all(|part| part.wait().unwrap().success()));
+}
+
+/// Whoever looks on a run, and so knows which step it is in.
+struct Onlooker {
+    blocks: BlockInbox,
+    seen: Option<u64>,
+}
+
+impl Onlooker {
+    fn look(&mut self) -> bool {
+        let mut came = false;
+        while let Some(block) = self.blocks.receive().unwrap() {
+            self.seen = Step::number_in(block.bytes());
+            came = true;
+        }
+        came
+    }
+
+    /// The step in which the run stands still.
+    fn standstill(&mut self) -> u64 {
+        let mut quiet = 0;
+        wait_until("the run to stand still", || {
+            quiet = if self.look() { 0 } else { quiet + 1 };
+            quiet >= 20
+        });
+        self.seen.map_or(0, |step| step + 1)
+    }
+}
+
+/// Sends a frame in somebody's name; returns how many it reached.
+fn forge<R: Record>(outbox: &mut IoxOutbox<R>, index: u16, step: u64, records: &[R]) -> usize {
+    let header = FrameHeader {
+        run_id: RUN_ID,
+        schema_hash: schema_hash(),
+        step,
+        sender_role: Role::Coordinator as u16,
+        sender_index: index,
+        ..FrameHeader::default()
+    };
+    let fill = |slots: &mut Slots<'_, R>| records.iter().for_each(|r| slots.push(*r));
+    outbox.loan(header, records.len(), fill).unwrap().send().unwrap()
+}
+
+#[test]
+fn well_formed_frames_of_a_process_without_a_place_steer_nobody() {
+    // Three coordinators in a row; the tree merges from both sides into the last.
+    let scenario = ["tree", "--set", "end.time_s=300"];
+    let expected = common::hash(&Site::new("u").summary(&[&scenario[..], &["--in-process"]].concat()));
+    let name = unique_name("forge");
+    let start = |program: &str, arguments: &[&str]| {
+        let mut command = Command::new(program);
+        command.args(["--run", &name]).args(arguments).stdin(Stdio::null());
+        command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+    };
+    let share = ["--coord-procs", "3", "--ctrl-procs", "2", "--observed", "--run-id", "77", "--json", "-"];
+    let world = start(env!("CARGO_BIN_EXE_cz-world"), &[&scenario[..], &share].concat());
+    let run: RunName = name.parse().unwrap();
+    let space = RunSpace::enter(&run).unwrap();
+    let mut blocks = None;
+    wait_until("the run to be looked on", || {
+        blocks = space.open_blocks(SERVICE_OBSERVER).ok().flatten();
+        blocks.is_some()
+    });
+    let mut onlooker = Onlooker { blocks: blocks.unwrap(), seen: None };
+    // Nobody but the world sends states, or says who has which place, from before anybody can join.
+    wait_until("the attach desk", || space.open_attach_line().is_ok());
+    let own_state = format!("{SERVICE_COORDINATOR_STATE_PREFIX}0");
+    for service in [SERVICE_STATE, &own_state] {
+        let service = space.open::<VehicleState>(service).unwrap();
+        assert!(service.outbox(1).is_err(), "there is room for another sender of states");
+    }
+    assert!(space.open::<Member>(SERVICE_MEMBERS).unwrap().outbox(1).is_err());
+    let mut coordination = space.open::<Assignment>(SERVICE_COORDINATION).unwrap().outbox(8).unwrap();
+    let mut summaries: Vec<_> = (0..3)
+        .map(|i| space.open(&format!("{SERVICE_SUMMARY_PREFIX}{i}")).unwrap().outbox(8).unwrap())
+        .collect();
+
+    let indexed = |program, i: usize| start(program, &["--index", ["0", "1", "2"][i]]);
+    let coordinators: Vec<Child> = (0..3).map(|i| indexed(env!("CARGO_BIN_EXE_cz-coord"), i)).collect();
+    let controllers: Vec<Child> = (0..2).map(|i| indexed(env!("CARGO_BIN_EXE_cz-ctrl"), i)).collect();
+    let mut forged = [0, 0];
+    for round in 0..12 {
+        // One coordinator is held at its next event, and somebody else is quicker.
+        let victim = round % 3;
+        common::send(coordinators[victim].id(), Signal::STOP);
+        let step = onlooker.standstill();
+        // Empty, it would do for the true one; a controller that took it would know no partner.
+        forged[0] += forge(&mut coordination, victim as u16, step, &[]);
+        for (to, outbox) in summaries.iter_mut().enumerate().filter(|(to, _)| *to != victim) {
+            let full = |zone| ZoneSummary {
+                from_zone: zone,
+                to_zone: to as u32,
+                vehicles: 999,
+                segment_vehicles: 999,
+                ..ZoneSummary::default()
+            };
+            let full: Vec<ZoneSummary> = (0..7).map(full).collect();
+            forged[1] += forge(outbox, victim as u16, step.saturating_sub(1), &full);
+            forged[1] += forge(outbox, victim as u16, step, &full);
+        }
+        // Long enough to be taken by those who wait.
+        std::thread::sleep(std::time::Duration::from_millis(50));
+        common::send(coordinators[victim].id(), Signal::CONT);
+        let past = onlooker.seen;
+        wait_until("the run to go on", || onlooker.look() && onlooker.seen > past);
+    }
+    drop((coordination, summaries));
+    // The recorder's place is given up too, or the world would wait for it in vain.
+    let output = {
+        let mut world = world;
+        wait_until("the world to end", || {
+            onlooker.look();
+            world.try_wait().unwrap().is_some()
+        });
+        world.wait_with_output().unwrap()
+    };
+    drop(onlooker);
+    drop(space);
+    assert!(output.status.success(), "{output:?}");
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(common::hash(&summary), expected, "{summary}");
+    assert!(forged[0] >= 12 && forged[1] > 0, "{forged:?} frames arrived");
+    let own = format!("(process {})", std::process::id());
+    let refused = summary["refused"].to_string();
+    assert!(refused.contains(&own) && refused.contains("it claims to come from coordinator"), "{refused}");
+    let said = |part: Child| {
+        let output = part.wait_with_output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        String::from_utf8(output.stderr).unwrap()
+    };
+    for said in controllers.into_iter().map(said) {
+        assert!(
+            said.contains(" refused ") && said.contains(&own),
+            "a controller has refused nothing: {said:?}"
+        );
+        assert!(said.contains("it claims to come from coordinator"), "{said}");
+    }
+    let said: String = coordinators.into_iter().map(said).collect();
+    assert!(
+        said.contains(" refused ") && said.contains(&own),
+        "no coordinator has refused anything: {said:?}"
+    );
+    println!("{forged:?} forged frames of coordination and summaries; {refused}");
 }

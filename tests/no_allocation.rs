@@ -9,13 +9,14 @@ use control_zones::control::ControllerPool;
 use control_zones::coordination::Coordinator;
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::lockstep::{
-    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity, Progress, WorldDriver,
-    WorldPorts,
+    ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Identity, Members, Progress,
+    Seat, WorldDriver, WorldPorts,
 };
 use control_zones::scenario::{Override, Scenario, load};
 use control_zones::transport::iox::{IoxOutbox, RunSpace, ServiceLimits};
+use control_zones::transport::{Backlog, Loan, Outbox, Slots};
 use control_zones::world::World;
-use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{self as frames, Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -77,13 +78,17 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
     let scenario = scenario();
     let run = format!("alloc-{}", std::process::id()).parse().unwrap();
     let space = RunSpace::enter(&run).unwrap();
-    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 1 };
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 1, backlog: Backlog::STEPS };
     let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits).unwrap();
     let coordinator_state = space.create::<VehicleState>("cz/coordinator-state/0", limits).unwrap();
     let both = ServiceLimits { subscribers: 2, ..limits };
     let coordination = space.create::<Assignment>(frames::SERVICE_COORDINATION, both).unwrap();
     let summaries = space.create::<ZoneSummary>("cz/summary/0", limits).unwrap();
     let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits).unwrap();
+    // Everybody's word is checked, as in a run of several processes.
+    let told = ServiceLimits { backlog: Backlog::Last, ..both };
+    let members = space.create::<Member>(frames::SERVICE_MEMBERS, told).unwrap();
+    let own = std::process::id();
     let zones = 0..scenario.network.zones.len() as u32;
     let identity = |role| Identity { run_id: 7, role, index: 0, generation: 0 };
     let neighbours: Vec<(u16, Range<u32>, IoxOutbox<ZoneSummary>)> = Vec::new();
@@ -94,6 +99,7 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
             summaries: summaries.inbox().unwrap(),
             neighbours,
             coordination: coordination.outbox(256).unwrap(),
+            members: Members::told_by(own, members.inbox().unwrap()),
         },
         identity(Role::Coordinator),
     );
@@ -103,6 +109,7 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
             state: state.inbox().unwrap(),
             coordination: coordination.inbox().unwrap(),
             command: command.outbox(256).unwrap(),
+            members: Members::told_by(own, members.inbox().unwrap()),
         },
         identity(Role::Controller),
         0,
@@ -115,6 +122,13 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
         coordination: Some(coordination.inbox().unwrap()),
     };
     let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, 7, 1);
+    world.seat(Role::Coordinator, 0, Seat::new(0, own));
+    world.seat(Role::Controller, 0, Seat::new(0, own));
+    let mut desk = members.outbox(2).unwrap();
+    let told: Vec<Member> = world.members().collect();
+    let header = Identity { index: 0, ..identity(Role::World) }.header(0, 0);
+    let fill = |slots: &mut Slots<'_, Member>| told.iter().for_each(|m| slots.push(*m));
+    desk.loan(header, told.len(), fill).unwrap().send().unwrap();
     let (mut judge, mut finished) = (Judge::new(LOANS_PER_STEP), false);
     while !finished {
         let step = world.world().step();

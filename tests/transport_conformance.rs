@@ -7,7 +7,7 @@ mod common;
 use common::unique_name;
 use control_zones::transport::iox::{IoxInbox, IoxOutbox, RunName, RunSpace, Service, ServiceLimits};
 use control_zones::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
-use control_zones::transport::{Frame, Inbox, Loan, Outbox, TransportError};
+use control_zones::transport::{Backlog, Frame, Inbox, Loan, Outbox, TransportError};
 use ipc_schemas::{FrameHeader, VehicleCommand, schema_hash};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
@@ -24,22 +24,38 @@ trait Bench {
     fn open(senders: usize, receivers: usize) -> Self;
     /// The ends, to be taken by index.
     fn ends(&mut self) -> (&mut [Self::Out], &mut [Self::In]);
+    /// Another sender.
+    fn join(&mut self) -> Self::Out;
+    /// Closes the last receiver.
+    fn close_inbox(&mut self);
 }
 
-struct Memory(Vec<MemoryOutbox<VehicleCommand>>, Vec<MemoryInbox<VehicleCommand>>);
+struct Memory(
+    Vec<MemoryOutbox<VehicleCommand>>,
+    Vec<MemoryInbox<VehicleCommand>>,
+    MemoryService<VehicleCommand>,
+);
 
 impl Bench for Memory {
     type Out = MemoryOutbox<VehicleCommand>;
     type In = MemoryInbox<VehicleCommand>;
 
     fn open(senders: usize, receivers: usize) -> Memory {
-        let mut service = MemoryService::new();
+        let service = MemoryService::new();
         let inboxes = (0..receivers).map(|_| service.inbox()).collect();
-        Memory((0..senders).map(|_| service.outbox()).collect(), inboxes)
+        Memory((0..senders).map(|_| service.outbox()).collect(), inboxes, service)
     }
 
     fn ends(&mut self) -> (&mut [Self::Out], &mut [Self::In]) {
         (&mut self.0, &mut self.1)
+    }
+
+    fn join(&mut self) -> Self::Out {
+        self.2.outbox()
+    }
+
+    fn close_inbox(&mut self) {
+        self.1.pop();
     }
 }
 
@@ -47,7 +63,7 @@ impl Bench for Memory {
 struct Iceoryx2 {
     outboxes: Vec<IoxOutbox<VehicleCommand>>,
     inboxes: Vec<IoxInbox<VehicleCommand>>,
-    _service: Service<VehicleCommand>,
+    service: Service<VehicleCommand>,
     _space: RunSpace,
 }
 
@@ -58,18 +74,31 @@ impl Bench for Iceoryx2 {
     fn open(senders: usize, receivers: usize) -> Iceoryx2 {
         let run: RunName = unique_name("conf").parse().unwrap();
         let space = RunSpace::enter(&run).unwrap();
-        let limits = ServiceLimits { publishers: senders, subscribers: receivers, nodes: 1 };
+        let limits = ServiceLimits {
+            publishers: senders + 1,
+            subscribers: receivers,
+            nodes: 1,
+            backlog: Backlog::STEPS,
+        };
         let service = space.create(SERVICE, limits).unwrap();
         Iceoryx2 {
             outboxes: (0..senders).map(|_| service.outbox(EXPECTED).unwrap()).collect(),
             inboxes: (0..receivers).map(|_| service.inbox().unwrap()).collect(),
-            _service: service,
+            service,
             _space: space,
         }
     }
 
     fn ends(&mut self) -> (&mut [Self::Out], &mut [Self::In]) {
         (&mut self.outboxes, &mut self.inboxes)
+    }
+
+    fn join(&mut self) -> Self::Out {
+        self.service.outbox(EXPECTED).unwrap()
+    }
+
+    fn close_inbox(&mut self) {
+        self.inboxes.pop();
     }
 }
 
@@ -260,6 +289,62 @@ fn frames_stay_as_they_are_while_held<B: Bench>() {
     }
 }
 
+fn what_a_sender_has_left_comes_to_those_who_had_taken_from_it<B: Bench>() {
+    let mut bench = B::open(0, 3);
+    let mut sender = bench.join();
+    let (_, inboxes) = bench.ends();
+    assert_eq!(send(&mut sender, 1, 2), Ok(3));
+    check(&receive(&mut inboxes[0]).unwrap(), 1, 2);
+    assert_eq!(send(&mut sender, 2, 1), Ok(3));
+    drop(sender);
+    check(&receive(&mut inboxes[0]).unwrap(), 2, 1);
+    assert!(receive(&mut inboxes[0]).is_none());
+    assert!(receive(&mut inboxes[1]).is_none(), "it went with its sender");
+}
+
+fn having_looked_for_a_frame_is_not_having_taken_one<B: Bench>() {
+    let mut bench = B::open(0, 1);
+    let mut sender = bench.join();
+    let (_, inboxes) = bench.ends();
+    assert!(receive(&mut inboxes[0]).is_none());
+    assert_eq!(send(&mut sender, 1, 2), Ok(1));
+    drop(sender);
+    assert!(receive(&mut inboxes[0]).is_none(), "it went with its sender");
+}
+
+fn receivers_are_counted_until_they_leave<B: Bench>() {
+    let mut bench = B::open(1, 3);
+    let count = |bench: &mut B| {
+        let mut count = 0;
+        bench.ends().0[0].receivers(&mut |process| {
+            assert!(process.is_none_or(|id| id == std::process::id()));
+            count += 1;
+        });
+        count
+    };
+    assert_eq!(count(&mut bench), 3);
+    bench.close_inbox();
+    assert_eq!(count(&mut bench), 2);
+    let (outboxes, inboxes) = bench.ends();
+    assert_eq!(send(&mut outboxes[0], 1, 1), Ok(2));
+    // Taken or not: a receiver is there until it leaves.
+    receive(&mut inboxes[0]);
+    assert_eq!(count(&mut bench), 2);
+}
+
+fn each_sending_end_has_an_origin_of_its_own<B: Bench>() {
+    let mut bench = B::open(2, 1);
+    let (outboxes, inboxes) = bench.ends();
+    let mut origins = Vec::new();
+    for (step, sender) in [0, 1, 0, 1].into_iter().enumerate() {
+        send(&mut outboxes[sender], step as u64, 1).unwrap();
+        origins.push(receive(&mut inboxes[0]).unwrap().origin());
+    }
+    assert_eq!(origins[..2], origins[2..]);
+    assert_ne!(origins[0], origins[1]);
+    assert!(inboxes[0].process_of(origins[0]).is_none_or(|id| id == std::process::id()));
+}
+
 macro_rules! conformance {
     ($($test:ident),* $(,)?) => {
         mod memory {
@@ -282,6 +367,10 @@ conformance!(
     a_loan_dropped_is_never_seen,
     a_frame_half_written_is_never_seen,
     frames_stay_as_they_are_while_held,
+    what_a_sender_has_left_comes_to_those_who_had_taken_from_it,
+    having_looked_for_a_frame_is_not_having_taken_one,
+    receivers_are_counted_until_they_leave,
+    each_sending_end_has_an_origin_of_its_own,
 );
 
 #[test]
@@ -289,7 +378,7 @@ fn the_space_of_the_last_to_leave_is_empty() {
     let name = unique_name("space");
     let run: RunName = name.parse().unwrap();
     let space = RunSpace::enter(&run).unwrap();
-    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2, backlog: Backlog::STEPS };
     let service = space.create::<VehicleCommand>(SERVICE, limits).unwrap();
     let other = RunSpace::enter(&run).unwrap();
     let opened = other.open::<VehicleCommand>(SERVICE).unwrap();

@@ -94,7 +94,7 @@ fn scenario() -> Arc<Scenario> {
 fn run(lie: impl Fn(&World) -> (Vec<VehicleCommand>, Vec<Assignment>)) -> (u64, Vec<VehicleCommand>) {
     let mut world = World::new(scenario(), 1);
     world.share_out(1);
-    let (mut state, mut coordinator_state) = (MemoryService::new(), MemoryService::new());
+    let (state, coordinator_state) = (MemoryService::new(), MemoryService::new());
     let (mut states, mut coordinator_states) = (state.tap(), coordinator_state.tap());
     let (command, coordination) = (Queue::<VehicleCommand>::new(), Queue::<Assignment>::new());
     let ports = WorldPorts {

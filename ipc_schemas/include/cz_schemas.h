@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0xfb18d61d5f65d583)
+#define CZ_SCHEMA_HASH UINT64_C(0x3e9f1a13b126324d)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -167,6 +167,9 @@
 #define CZ_SERVICE_SUMMARY_PREFIX "cz/summary/"
 /** Controllers -> world: `cz_vehicle_command_t` of every step. */
 #define CZ_SERVICE_COMMAND "cz/command"
+/** World -> coordinators and controllers: `cz_member_t`, who has which place. Overflows: only the
+ *  last frame counts. */
+#define CZ_SERVICE_MEMBERS "cz/members"
 /** World -> whoever records the run: every step as one block of bytes. Overflows, so that nobody
  *  waits for its reader. */
 #define CZ_SERVICE_OBSERVER "cz/observer"
@@ -181,6 +184,7 @@
 #define CZ_TYPE_NAME_ASSIGNMENT "cz.Assignment.v1"
 #define CZ_TYPE_NAME_ZONE_SUMMARY "cz.ZoneSummary.v1"
 #define CZ_TYPE_NAME_VEHICLE_COMMAND "cz.VehicleCommand.v1"
+#define CZ_TYPE_NAME_MEMBER "cz.Member.v1"
 #define CZ_TYPE_NAME_ATTACH_REQUEST "cz.AttachRequest.v1"
 #define CZ_TYPE_NAME_ATTACH_REPLY "cz.AttachReply.v1"
 #define CZ_TYPE_NAME_RUN_SPEC "cz.RunSpec.v1"
@@ -399,6 +403,29 @@ CZ_ASSERT_(vehicle_command_zone_offset, offsetof(cz_vehicle_command_t, zone) == 
 CZ_ASSERT_(vehicle_command_binding_rows_offset, offsetof(cz_vehicle_command_t, binding_rows) == 88);
 CZ_ASSERT_(vehicle_command_mode_offset, offsetof(cz_vehicle_command_t, mode) == 92);
 CZ_ASSERT_(vehicle_command_verdict_offset, offsetof(cz_vehicle_command_t, verdict) == 94);
+
+/** World -> coordinators and controllers: the process that has a place in the run.
+ *
+ *  A frame lists everybody but the world, and the last one counts. The world sends it before the
+ *  first state, and again before whoever takes a place anew may send its first frame. A receiver
+ *  believes a frame of a coordinator only when the transport says that it comes from the process
+ *  that has its place. */
+typedef struct cz_member {
+    /** The process. */
+    uint32_t process_id;
+    /** Generation in the headers of its frames. */
+    uint32_t generation;
+    /** 2 coordinator, 3 controller. */
+    uint16_t role;
+    /** Index among the processes of the role. */
+    uint16_t index;
+} cz_member_t;
+CZ_ASSERT_(member_size, sizeof(cz_member_t) == 12);
+CZ_ASSERT_ALIGN_(cz_member_t, 4);
+CZ_ASSERT_(member_process_id_offset, offsetof(cz_member_t, process_id) == 0);
+CZ_ASSERT_(member_generation_offset, offsetof(cz_member_t, generation) == 4);
+CZ_ASSERT_(member_role_offset, offsetof(cz_member_t, role) == 8);
+CZ_ASSERT_(member_index_offset, offsetof(cz_member_t, index) == 10);
 
 /** Participant -> world: let me in; later, I am ready.
  *

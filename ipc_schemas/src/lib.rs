@@ -12,6 +12,7 @@ mod command;
 mod coordination;
 pub mod generate;
 mod header;
+mod member;
 pub mod record;
 mod run_spec;
 mod services;
@@ -24,6 +25,7 @@ pub use code::{Code, CodeValue};
 pub use command::*;
 pub use coordination::*;
 pub use header::*;
+pub use member::*;
 pub use record::{Field, Layout, Record, Scalar, bytes_of, records_from};
 pub use run_spec::*;
 pub use services::*;
@@ -34,12 +36,13 @@ pub use summary::*;
 compile_error!("frames are little-endian and are used in place");
 
 /// The layouts of all record types, in the order the schema hash covers them.
-pub const LAYOUTS: [Layout; 9] = [
+pub const LAYOUTS: [Layout; 10] = [
     FrameHeader::LAYOUT,
     VehicleState::LAYOUT,
     Assignment::LAYOUT,
     ZoneSummary::LAYOUT,
     VehicleCommand::LAYOUT,
+    Member::LAYOUT,
     AttachRequest::LAYOUT,
     AttachReply::LAYOUT,
     RunSpec::LAYOUT,

@@ -14,6 +14,9 @@ codes! {
     pub const SERVICE_SUMMARY_PREFIX: &str = "cz/summary/";
     /// Controllers → world: [`VehicleCommand`](crate::VehicleCommand) of every step.
     pub const SERVICE_COMMAND: &str = "cz/command";
+    /// World → coordinators and controllers: [`Member`](crate::Member), who has which place. Overflows: only
+    /// the last frame counts.
+    pub const SERVICE_MEMBERS: &str = "cz/members";
     /// World → whoever records the run: every step as one block of bytes. Overflows, so that nobody waits for
     /// its reader.
     pub const SERVICE_OBSERVER: &str = "cz/observer";

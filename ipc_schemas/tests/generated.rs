@@ -7,8 +7,8 @@ use std::process::{Command, Stdio};
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use ipc_schemas::{
-    ApproachSpec, Assignment, AttachReply, AttachRequest, CODES, CodeValue, FrameHeader, LAYOUTS, Role,
-    RunSpec, VehicleCommand, VehicleState, ZoneSummary, generate, schema_hash, schema_text,
+    ApproachSpec, Assignment, AttachReply, AttachRequest, CODES, CodeValue, FrameHeader, LAYOUTS, Member,
+    Role, RunSpec, VehicleCommand, VehicleState, ZoneSummary, generate, schema_hash, schema_text,
 };
 
 /// Type name, size, and the fields with their scalar types and offsets.
@@ -16,7 +16,7 @@ type Golden = (&'static str, usize, &'static [(&'static str, &'static str, usize
 
 /// The layouts of version 1, written out by hand. A change here breaks every program that was built
 /// with the old frames: give the record a new version in its type name instead.
-const GOLDEN: [Golden; 9] = [
+const GOLDEN: [Golden; 10] = [
     (
         "cz.FrameHeader.v1",
         64,
@@ -99,6 +99,11 @@ const GOLDEN: [Golden; 9] = [
             ("mode", "u16", 92),
             ("verdict", "u16", 94),
         ],
+    ),
+    (
+        "cz.Member.v1",
+        12,
+        &[("process_id", "u32", 0), ("generation", "u32", 4), ("role", "u16", 8), ("index", "u16", 10)],
     ),
     (
         "cz.AttachRequest.v1",
@@ -270,6 +275,7 @@ fn the_transport_registers_the_same_type_names() {
             Assignment::type_name(),
             ZoneSummary::type_name(),
             VehicleCommand::type_name(),
+            Member::type_name(),
             AttachRequest::type_name(),
             AttachReply::type_name(),
             RunSpec::type_name(),

@@ -8,8 +8,8 @@ use super::say::say;
 use super::{AppError, record, report};
 use crate::lockstep::RefusedFrames;
 use crate::process::{
-    Joining, Observation, Settled, Settling, StopFlag, WorldOptions, first_missing_step, new_run_id,
-    run_controller, run_coordinator, run_world,
+    Departure, Joining, Observation, Settled, Settling, StopFlag, WorldOptions, first_missing_step,
+    new_run_id, run_controller, run_coordinator, run_world,
 };
 use crate::scenario::scenario_hash;
 use crate::world::World;
@@ -66,17 +66,21 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     let settling = settling(&args.conduct.wait, &*tell);
     if args.supervised.is_some() {
         let mut last = Instant::now();
-        let outcome = run_world(&scenario, &options, past, &settling, &stop, |world| {
+        let (outcome, departure) = run_world(&scenario, &options, past, &settling, &stop, |world| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
                 tell_supervisor(&WorldLine::progress(world));
             }
         })?;
         tell_supervisor(&WorldLine::Outcome(Box::new(outcome)));
+        leave(departure, &options, &stop);
         return Ok(());
     }
-    let outcome = run_world(&scenario, &options, past, &settling, &stop, |_: &World| {});
-    let outcome = outcome.map_err(AppError::from);
+    let run = run_world(&scenario, &options, past, &settling, &stop, |_: &World| {});
+    let (outcome, departure) = match run {
+        Ok((outcome, departure)) => (Ok(outcome), Some(departure)),
+        Err(error) => (Err(AppError::from(error)), None),
+    };
     let recorded = match observation {
         Some(observation) => match observation.stop() {
             Ok(recording) => recording.finish(&outcome),
@@ -86,8 +90,20 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     };
     let outcome = outcome?;
     let processes = 1 + options.coordinators + options.controllers;
-    Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome).deliver(args.json.as_deref())?;
-    recorded
+    let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome);
+    let delivered = summary.deliver(args.json.as_deref());
+    if let Some(departure) = departure {
+        leave(departure, &options, &stop);
+    }
+    delivered.and(recorded)
+}
+
+/// Leaves the run when the others have; whoever has not by then misses its end.
+fn leave(departure: Departure, options: &WorldOptions, stop: &StopFlag) {
+    for peer in departure.wait(stop) {
+        let (id, seconds) = (peer.process_id, options.peer_timeout.as_secs_f64());
+        say(format_args!("cz: {peer} (process {id}) has not left the run {seconds} s after its end"));
+    }
 }
 
 pub(super) fn coordinator(args: &PartArgs) -> Result<(), AppError> {

@@ -13,7 +13,7 @@ use crate::process::{
 };
 use crate::scenario::Scenario;
 use crate::transport::iox::{RunName, RunSpace, ServiceLimits};
-use crate::transport::{Frame, Loan, Outbox};
+use crate::transport::{Backlog, Frame, Loan, Outbox};
 use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState};
 use serde::Serialize;
 use std::hint::black_box;
@@ -216,7 +216,7 @@ fn iceoryx2(
 ) -> Result<Percentiles, BenchError> {
     let run = own_run("trip");
     let space = RunSpace::enter(&run)?;
-    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2, backlog: Backlog::STEPS };
     let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits)?;
     let mut inbox = command.inbox()?;
     let state = space.create::<VehicleState>(frames::SERVICE_STATE, limits)?;
@@ -306,7 +306,7 @@ fn iceoryx2_step(
 ) -> Result<Stepped, BenchError> {
     let run = own_run("step");
     let space = RunSpace::enter(&run)?;
-    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2 };
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 2, backlog: Backlog::STEPS };
     let expected = expected_vehicles(scenario);
     let command = space.create::<VehicleCommand>(frames::SERVICE_COMMAND, limits)?;
     let mut commands = command.inbox()?;

@@ -5,12 +5,13 @@ use super::socket::{Connection, Stream};
 use super::step::{CONTROLLER, follow};
 use super::{BenchError, io};
 use crate::control::ControllerPool;
-use crate::lockstep::{ControllerDriver, ControllerPorts};
+use crate::lockstep::{ControllerDriver, ControllerPorts, Members};
 use crate::process::{Placement, expected_vehicles, place};
 use crate::scenario::Scenario;
 use crate::transport::iox::{RunName, RunSpace, SpaceError};
+use crate::transport::memory::MemoryInbox;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
-use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState};
+use ipc_schemas::{self as frames, Assignment, Member, Role, VehicleCommand, VehicleState};
 use std::hint::black_box;
 use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
@@ -130,6 +131,7 @@ fn control(stream: Stream, scenario: &Arc<Scenario>) -> Result<(), BenchError> {
         state: connection.inbox::<VehicleState>(),
         coordination: connection.inbox::<Assignment>(),
         command: connection.outbox::<VehicleCommand>(),
+        members: Members::<MemoryInbox<Member>>::as_claimed(),
     };
     follow(ControllerDriver::new(pool(scenario), ports, CONTROLLER, 0))
 }
@@ -143,6 +145,7 @@ fn control_frames(run: &RunName, scenario: &Arc<Scenario>) -> Result<(), BenchEr
         state: space.open(frames::SERVICE_STATE)?.inbox()?,
         coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
         command,
+        members: Members::<MemoryInbox<Member>>::as_claimed(),
     };
     // This says that the ends are open.
     ports.command.loan(frames::FrameHeader::default(), 0, |_| {})?.send()?;

@@ -4,14 +4,15 @@ use super::BenchError;
 use super::peer::PATIENCE;
 use crate::coordination::Coordinator;
 use crate::lockstep::{
-    ControllerDriver, CoordinatorDriver, CoordinatorPorts, Identity, Progress, WorldDriver, WorldPorts,
+    ControllerDriver, CoordinatorDriver, CoordinatorPorts, Identity, Members, Progress, WorldDriver,
+    WorldPorts,
 };
 use crate::process::{Percentiles, WARM_UP_STEPS, new_histogram};
 use crate::scenario::Scenario;
 use crate::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
 use crate::transport::{Inbox, Outbox};
 use crate::world::World;
-use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::ops::Range;
 use std::sync::Arc;
 use std::time::Instant;
@@ -47,14 +48,15 @@ where
     A: Outbox<Assignment>,
     C: Inbox<VehicleCommand>,
 {
-    let mut coordinator_state: MemoryService<VehicleState> = MemoryService::new();
-    let mut summaries: MemoryService<ZoneSummary> = MemoryService::new();
+    let coordinator_state: MemoryService<VehicleState> = MemoryService::new();
+    let summaries: MemoryService<ZoneSummary> = MemoryService::new();
     let zones = 0..scenario.network.zones.len() as u32;
-    let coordinator_ports = CoordinatorPorts::<_, MemoryInbox<ZoneSummary>, _, _> {
+    let coordinator_ports = CoordinatorPorts::<_, MemoryInbox<ZoneSummary>, _, _, MemoryInbox<Member>> {
         state: coordinator_state.inbox(),
         summaries: summaries.inbox(),
         neighbours: Vec::<(u16, Range<u32>, MemoryOutbox<ZoneSummary>)>::new(),
         coordination,
+        members: Members::as_claimed(),
     };
     let identity = Identity { run_id: RUN_ID, role: Role::Coordinator, index: 0, generation: 0 };
     let role = Coordinator::new(scenario.clone(), zones);
@@ -97,11 +99,12 @@ where
 }
 
 /// Answers all steps of such a run.
-pub(super) fn follow<S, A, C>(mut driver: ControllerDriver<S, A, C>) -> Result<(), BenchError>
+pub(super) fn follow<S, A, C, M>(mut driver: ControllerDriver<S, A, C, M>) -> Result<(), BenchError>
 where
     S: Inbox<VehicleState>,
     A: Inbox<Assignment>,
     C: Outbox<VehicleCommand>,
+    M: Inbox<Member>,
 {
     while spin(|| Ok(driver.advance()?))? != Progress::Finished {}
     Ok(())

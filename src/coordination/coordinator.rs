@@ -63,6 +63,16 @@ impl Coordinator {
         }
     }
 
+    /// The zones it coordinates.
+    pub fn zones(&self) -> Range<ZoneId> {
+        self.zones.clone()
+    }
+
+    /// Simulated time of a step, ns.
+    pub fn time_ns(&self, step: u64) -> u64 {
+        step * self.scenario.dt_ns
+    }
+
     /// Takes the summaries another coordinator sent in the previous step; those to zones of other
     /// processes are skipped.
     pub fn receive(&mut self, summaries: &[ZoneSummary]) {

@@ -1,34 +1,37 @@
 //! A controller process's side of a step: take the state, wait for coordination if there is any, answer.
 
+use super::members::check_sender;
 use super::refusals::Refusals;
-use super::world::check_state;
-use super::{Awaited, Handover, Identity, InHand, LockstepError, Progress, Refusal, RefusedFrames};
+use super::{Awaited, Handover, Identity, InHand, LockstepError, Members, Progress, Refusal, RefusedFrames};
 use crate::control::ControllerPool;
 use crate::scenario::ControllerNames;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
 use ipc_schemas::{
-    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, HeaderFault, Role, VehicleCommand, VehicleState,
+    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, Member, Role, VehicleCommand, VehicleState,
 };
 
 /// A controller's ends of the services.
 #[derive(Debug)]
-pub struct ControllerPorts<S, A, C> {
+pub struct ControllerPorts<S, A, C, M> {
     /// State frames from the world.
     pub state: S,
     /// Coordination frames from coordinators.
     pub coordination: A,
     /// Commands to the world.
     pub command: C,
+    /// Whom to believe.
+    pub members: Members<M>,
 }
 
 /// Drives a [`ControllerPool`] through the lockstep.
 #[derive(Debug)]
-pub struct ControllerDriver<S, A, C>
+pub struct ControllerDriver<S, A, C, M>
 where
     S: Inbox<VehicleState>,
+    A: Inbox<Assignment>,
 {
     pool: ControllerPool,
-    ports: ControllerPorts<S, A, C>,
+    ports: ControllerPorts<S, A, C, M>,
     identity: Identity,
     next_step: u64,
     /// The state being answered, and the coordinators whose frames it still needs.
@@ -36,22 +39,25 @@ where
     /// What is to be taken over with the next state.
     inherited: Option<Handover>,
     refusals: Refusals,
+    /// Refused frames, held for a while so that their senders are passed over in favour of others.
+    detained: Vec<A::Frame>,
     finished: bool,
 }
 
-impl<S, A, C> ControllerDriver<S, A, C>
+impl<S, A, C, M> ControllerDriver<S, A, C, M>
 where
     S: Inbox<VehicleState>,
     A: Inbox<Assignment>,
     C: Outbox<VehicleCommand>,
+    M: Inbox<Member>,
 {
     /// A driver that answers from `first_step` on.
     pub fn new(
         pool: ControllerPool,
-        ports: ControllerPorts<S, A, C>,
+        ports: ControllerPorts<S, A, C, M>,
         identity: Identity,
         first_step: u64,
-    ) -> ControllerDriver<S, A, C> {
+    ) -> ControllerDriver<S, A, C, M> {
         ControllerDriver {
             pool,
             ports,
@@ -60,6 +66,7 @@ where
             pending: None,
             inherited: None,
             refusals: Refusals::default(),
+            detained: Vec::new(),
             finished: false,
         }
     }
@@ -95,10 +102,9 @@ where
 
     fn take_state(&mut self) -> Result<Progress, LockstepError> {
         let step = self.next_step;
-        let Some(state) = self.ports.state.receive()? else {
+        let Some(state) = self.receive_state()? else {
             return Ok(Progress::Waiting(Awaited { role: Role::World, missing: 1, what: "state", step }));
         };
-        check_state(self.identity.run_id, state.header(), state.records().len())?;
         let header = state.header();
         if header.flags & FLAG_END_OF_RUN != 0 {
             self.finished = true;
@@ -114,6 +120,14 @@ where
         let missing = header.coordinators_acting;
         self.pending = Some((InHand::Frame(state), missing));
         Ok(Progress::Advanced)
+    }
+
+    /// The next state of the world's; a frame of anybody else is as good as none.
+    fn receive_state(&mut self) -> Result<Option<S::Frame>, LockstepError> {
+        let ControllerPorts { state, members, .. } = &mut self.ports;
+        let Some(frame) = state.receive()? else { return Ok(None) };
+        let is_taken = members.check_state(self.identity.run_id, &frame, state, &mut self.refusals)?;
+        Ok(is_taken.then_some(frame))
     }
 
     /// Takes over with the first state at hand.
@@ -141,11 +155,12 @@ where
         mut missing: u64,
     ) -> Result<Progress, LockstepError> {
         let step = self.next_step;
+        let what = "coordination";
+        let awaited = Awaited { role: Role::Coordinator, missing, what, step };
         let Some(frame) = self.ports.coordination.receive()? else {
+            self.detained.clear();
             // If the run has gone on, what is missing here will never come.
-            if let Some(next) = self.ports.state.receive()? {
-                let run_id = self.identity.run_id;
-                check_state(run_id, next.header(), next.records().len())?;
+            if let Some(next) = self.receive_state()? {
                 if next.header().flags & FLAG_END_OF_RUN != 0 {
                     self.finished = true;
                     return Ok(Progress::Finished);
@@ -155,20 +170,24 @@ where
                 }
             }
             self.pending = Some((state, missing));
-            let what = "coordination";
-            return Ok(Progress::Waiting(Awaited { role: Role::Coordinator, missing, what, step }));
+            return Ok(Progress::Waiting(awaited));
         };
-        match self.judge(&frame, &state, missing) {
+        let judged = self.judge(&frame, &state, missing)?;
+        let mut progress = Progress::Advanced;
+        match judged {
             Ok(index) => missing &= !(1 << index),
             Err(None) => self.refusals.late += 1,
             Err(Some(refusal)) => {
                 let inbox = &self.ports.coordination;
                 let origin = frame.origin();
                 self.refusals.enter(frame.header(), origin, refusal, || inbox.process_of(origin));
+                self.detained.push(frame);
+                // However many of these come, waiting for the right one goes on.
+                progress = Progress::Waiting(awaited);
             }
         }
         self.pending = Some((state, missing));
-        Ok(Progress::Advanced)
+        Ok(progress)
     }
 
     /// Takes the frame; returns its sender, or why it is not taken, or nothing for one that is merely late.
@@ -177,32 +196,19 @@ where
         frame: &A::Frame,
         state: &InHand<S::Frame>,
         missing: u64,
-    ) -> Result<u16, Option<Refusal>> {
-        let header = frame.header();
-        let (step, index) = (self.next_step, header.sender_index);
-        let checked = ExpectedHeader {
-            run_id: self.identity.run_id,
-            role: Role::Coordinator,
-            index,
-            generation: header.generation,
-            step,
+    ) -> Result<Result<u16, Option<Refusal>>, LockstepError> {
+        let header = &{ *frame.header() };
+        let sent = (header, frame.records().len(), frame.origin());
+        let (run_id, step, index) = (self.identity.run_id, self.next_step, header.sender_index);
+        let ControllerPorts { coordination, members, .. } = &mut self.ports;
+        let seat = members.coordinator(run_id, header, frame.origin(), &mut self.refusals)?;
+        let generation = seat.as_ref().map_or(header.generation, |seat| seat.generation);
+        let expected = ExpectedHeader { run_id, role: Role::Coordinator, index, generation, step };
+        if let Err(reason) = check_sender(&expected, sent, seat, missing, coordination) {
+            return Ok(Err(reason));
         }
-        .check(header, frame.records().len());
-        match checked {
-            Err(HeaderFault::OtherStep { expected, found }) if found < expected => return Err(None),
-            Err(fault) => return Err(Some(fault.into())),
-            Ok(()) => {}
-        }
-        if index >= 64 {
-            return Err(Some(Refusal::Unexpected { step }));
-        }
-        if missing >> index & 1 == 0 {
-            return Err(None);
-        }
-        self.pool
-            .coordinate(state.records(), frame.records())
-            .map_err(|fault| Some(Refusal::Coordination { step, fault }))?;
-        Ok(index)
+        let taken = self.pool.coordinate(state.records(), frame.records());
+        Ok(taken.map(|()| index).map_err(|fault| Some(Refusal::Coordination { step, fault })))
     }
 
     fn answer(&mut self, state: &InHand<S::Frame>) -> Result<Progress, LockstepError> {

@@ -1,21 +1,19 @@
 //! A coordinator process's side of a step: take the state, wait for neighbours' summaries of the step
 //! before, tell neighbours and controllers.
 
+use super::members::check_sender;
 use super::refusals::Refusals;
-use super::world::check_state;
-use super::{Awaited, Handover, Identity, InHand, LockstepError, Progress, Refusal, RefusedFrames};
+use super::{Awaited, Handover, Identity, InHand, LockstepError, Members, Progress, Refusal, RefusedFrames};
 use crate::coordination::Coordinator;
 use crate::scenario::ControllerNames;
 use crate::scenario::ZoneId;
 use crate::transport::{Frame, Inbox, Loan, Outbox};
-use ipc_schemas::{
-    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault, Role, VehicleState, ZoneSummary,
-};
+use ipc_schemas::{Assignment, ExpectedHeader, FLAG_END_OF_RUN, Member, Role, VehicleState, ZoneSummary};
 use std::ops::Range;
 
 /// A coordinator's ends of the services.
 #[derive(Debug)]
-pub struct CoordinatorPorts<S, N, O, A> {
+pub struct CoordinatorPorts<S, N, O, A, M> {
     /// State frames from the world, only of the steps to act in.
     pub state: S,
     /// Summaries from neighbouring coordinator processes.
@@ -24,16 +22,19 @@ pub struct CoordinatorPorts<S, N, O, A> {
     pub neighbours: Vec<(u16, Range<ZoneId>, O)>,
     /// Coordination to controllers.
     pub coordination: A,
+    /// Whom to believe.
+    pub members: Members<M>,
 }
 
 /// Drives a [`Coordinator`] through the lockstep.
 #[derive(Debug)]
-pub struct CoordinatorDriver<S, N, O, A>
+pub struct CoordinatorDriver<S, N, O, A, M>
 where
     S: Inbox<VehicleState>,
+    N: Inbox<ZoneSummary>,
 {
     coordinator: Coordinator,
-    ports: CoordinatorPorts<S, N, O, A>,
+    ports: CoordinatorPorts<S, N, O, A, M>,
     identity: Identity,
     neighbour_mask: u64,
     last_step: Option<u64>,
@@ -42,23 +43,29 @@ where
     pending: Option<(InHand<S::Frame>, u64)>,
     /// Summaries of the pending step from neighbours who were quicker, for the next one: process, records.
     early: Vec<(u16, Vec<ZoneSummary>)>,
+    /// The step before a handover and what was sent to neighbours in it, to be sent again: what they had not
+    /// taken may have gone with its sender.
+    owed: Option<(u64, Vec<ZoneSummary>)>,
     refusals: Refusals,
+    /// Refused frames, held for a while so that their senders are passed over in favour of others.
+    detained: Vec<N::Frame>,
     finished: bool,
 }
 
-impl<S, N, O, A> CoordinatorDriver<S, N, O, A>
+impl<S, N, O, A, M> CoordinatorDriver<S, N, O, A, M>
 where
     S: Inbox<VehicleState>,
     N: Inbox<ZoneSummary>,
     O: Outbox<ZoneSummary>,
     A: Outbox<Assignment>,
+    M: Inbox<Member>,
 {
     /// A driver for a coordinator that has not acted yet.
     pub fn new(
         coordinator: Coordinator,
-        ports: CoordinatorPorts<S, N, O, A>,
+        ports: CoordinatorPorts<S, N, O, A, M>,
         identity: Identity,
-    ) -> CoordinatorDriver<S, N, O, A> {
+    ) -> CoordinatorDriver<S, N, O, A, M> {
         let neighbour_mask = ports.neighbours.iter().fold(0, |mask, (index, ..)| mask | 1 << index);
         CoordinatorDriver {
             coordinator,
@@ -69,7 +76,9 @@ where
             handed_over: None,
             pending: None,
             early: Vec::new(),
+            owed: None,
             refusals: Refusals::default(),
+            detained: Vec::new(),
             finished: false,
         }
     }
@@ -78,6 +87,11 @@ where
     pub fn take_over(&mut self, handover: Handover) {
         self.coordinator.restore(&handover.downstream, &handover.due);
         self.handed_over = Some(handover.step);
+        let zones = self.coordinator.zones();
+        let owes = handover.summarised >> self.identity.index & 1 == 1;
+        self.owed = handover.step.checked_sub(1).filter(|_| owes).map(|step| {
+            (step, handover.due.iter().filter(|s| zones.contains(&s.from_zone)).copied().collect())
+        });
         // Summaries of this step may have been sent before anybody was there to take them.
         self.early = self
             .ports
@@ -106,6 +120,9 @@ where
         if self.finished {
             return Ok(Progress::Finished);
         }
+        if let Some((step, summaries)) = self.owed.take() {
+            self.send_again(step, &summaries)?;
+        }
         match self.pending.take() {
             None => self.take_state(),
             Some((state, missing)) => self.take_summaries(state, missing),
@@ -113,13 +130,12 @@ where
     }
 
     fn take_state(&mut self) -> Result<Progress, LockstepError> {
-        let Some(state) = self.ports.state.receive()? else {
+        let Some(state) = self.receive_state()? else {
             let step = self.last_step.map_or(0, |s| s + 1);
             let what = "state of an event";
             return Ok(Progress::Waiting(Awaited { role: Role::World, missing: 1, what, step }));
         };
         let header = state.header();
-        check_state(self.identity.run_id, header, state.records().len())?;
         if header.flags & FLAG_END_OF_RUN != 0 {
             self.finished = true;
             return Ok(Progress::Finished);
@@ -144,6 +160,14 @@ where
         Ok(Progress::Advanced)
     }
 
+    /// The next state of the world's; a frame of anybody else is as good as none.
+    fn receive_state(&mut self) -> Result<Option<S::Frame>, LockstepError> {
+        let CoordinatorPorts { state, members, .. } = &mut self.ports;
+        let Some(frame) = state.receive()? else { return Ok(None) };
+        let is_taken = members.check_state(self.identity.run_id, &frame, state, &mut self.refusals)?;
+        Ok(is_taken.then_some(frame))
+    }
+
     /// Takes one summary, or acts when none is missing and none is left. What came twice is taken too: left
     /// alone, it would soon fill the inbox, and the next summary find no room.
     fn take_summaries(
@@ -155,15 +179,19 @@ where
         // were sent before the state was, but a quicker neighbour's next one may come in between: there is
         // no order between senders.
         let now = state.header().step;
+        let (what, step) = ("summary", now.wrapping_sub(1));
+        let awaited = Awaited { role: Role::Coordinator, missing, what, step };
         let Some(frame) = self.ports.summaries.receive()? else {
+            self.detained.clear();
             if missing == 0 {
                 return self.act(&state);
             }
             self.pending = Some((state, missing));
-            let (what, step) = ("summary", now - 1);
-            return Ok(Progress::Waiting(Awaited { role: Role::Coordinator, missing, what, step }));
+            return Ok(Progress::Waiting(awaited));
         };
-        match self.judge(frame.header(), frame.records().len(), now, missing) {
+        let judged = self.judge(&frame, now, missing)?;
+        let mut progress = Progress::Advanced;
+        match judged {
             Ok((index, true)) => self.early.push((index, frame.records().to_vec())),
             Ok((index, false)) => {
                 self.coordinator.receive(frame.records());
@@ -174,46 +202,53 @@ where
                 let inbox = &self.ports.summaries;
                 let origin = frame.origin();
                 self.refusals.enter(frame.header(), origin, refusal, || inbox.process_of(origin));
+                self.detained.push(frame);
+                // However many of these come, waiting for the right one goes on.
+                if missing != 0 {
+                    progress = Progress::Waiting(awaited);
+                }
             }
         }
         self.pending = Some((state, missing));
-        Ok(Progress::Advanced)
+        Ok(progress)
     }
 
     /// Whose summaries these are and whether they are for the next step; otherwise why they are not taken,
     /// or nothing for those that come twice: from a neighbour that has been replaced.
     fn judge(
-        &self,
-        header: &FrameHeader,
-        records: usize,
+        &mut self,
+        frame: &N::Frame,
         now: u64,
         missing: u64,
-    ) -> Result<(u16, bool), Option<Refusal>> {
-        let index = header.sender_index;
+    ) -> Result<Result<(u16, bool), Option<Refusal>>, LockstepError> {
+        let header = &{ *frame.header() };
+        let sent = (header, frame.records().len(), frame.origin());
+        let (run_id, index) = (self.identity.run_id, header.sender_index);
         let is_early = header.step == now;
-        let checked = ExpectedHeader {
-            run_id: self.identity.run_id,
-            role: Role::Coordinator,
-            index,
-            generation: header.generation,
-            // Before the first step nothing is due.
-            step: if is_early { now } else { now.wrapping_sub(1) },
-        }
-        .check(header, records);
-        match checked {
-            Err(HeaderFault::OtherStep { expected, found }) if found < expected => return Err(None),
-            Err(fault) => return Err(Some(fault.into())),
-            Ok(()) => {}
-        }
-        if index >= 64 || self.neighbour_mask >> index & 1 == 0 {
-            return Err(Some(Refusal::Unexpected { step: header.step }));
-        }
-        let has_come = if is_early {
-            self.early.iter().any(|(from, _)| *from == index)
-        } else {
-            missing >> index & 1 == 0
+        // Before the first step nothing is due.
+        let step = if is_early { now } else { now.wrapping_sub(1) };
+        let missing = match is_early {
+            true => self.early.iter().fold(self.neighbour_mask, |mask, (index, _)| mask & !(1 << index)),
+            false => missing,
         };
-        if has_come { Err(None) } else { Ok((index, is_early)) }
+        let is_neighbour = index < 64 && self.neighbour_mask >> index & 1 == 1;
+        let CoordinatorPorts { summaries, members, .. } = &mut self.ports;
+        let seat = members.coordinator(run_id, header, frame.origin(), &mut self.refusals)?;
+        let generation = seat.as_ref().map_or(header.generation, |seat| seat.generation);
+        let expected = ExpectedHeader { run_id, role: Role::Coordinator, index, generation, step };
+        let checked = check_sender(&expected, sent, seat.filter(|_| is_neighbour), missing, summaries);
+        Ok(checked.map(|()| (index, is_early)))
+    }
+
+    /// Sends neighbours what one before has sent them in that step.
+    fn send_again(&mut self, step: u64, summaries: &[ZoneSummary]) -> Result<(), LockstepError> {
+        let header = self.identity.header(step, self.coordinator.time_ns(step));
+        for (_, zones, outbox) in &mut self.ports.neighbours {
+            let to_it = || summaries.iter().filter(|s| zones.contains(&s.to_zone));
+            let loan = outbox.loan(header, to_it().count(), |slots| to_it().for_each(|s| slots.push(*s)))?;
+            loan.send()?;
+        }
+        Ok(())
     }
 
     fn act(&mut self, state: &InHand<S::Frame>) -> Result<Progress, LockstepError> {
@@ -244,6 +279,7 @@ where
 mod tests {
     use super::*;
     use crate::scenario::load_embedded;
+    use crate::transport::Backlog;
     use crate::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
     use ipc_schemas::FrameHeader;
     use std::sync::Arc;
@@ -265,6 +301,7 @@ mod tests {
         MemoryInbox<ZoneSummary>,
         MemoryOutbox<ZoneSummary>,
         MemoryOutbox<Assignment>,
+        MemoryInbox<Member>,
     >;
 
     /// A coordinator with these neighbours, and the services by which the others reach it and hear of it.
@@ -278,9 +315,9 @@ mod tests {
     impl Scene {
         fn new(neighbours: &[u16], generation: u32) -> Scene {
             let scenario = Arc::new(load_embedded("tree", &[], None).unwrap());
-            let mut states = MemoryService::new();
-            let mut summaries = MemoryService::new();
-            let mut coordination = MemoryService::new();
+            let states = MemoryService::new();
+            let summaries = MemoryService::holding(Backlog::Bounded(4));
+            let coordination = MemoryService::new();
             let inbox = coordination.inbox();
             let neighbour = |&i: &u16| (i, u32::from(i)..u32::from(i) + 1, MemoryService::new().outbox());
             let ports = CoordinatorPorts {
@@ -288,6 +325,7 @@ mod tests {
                 summaries: summaries.inbox(),
                 neighbours: neighbours.iter().map(neighbour).collect(),
                 coordination: coordination.outbox(),
+                members: Members::as_claimed(),
             };
             let role = Coordinator::new(scenario, u32::from(OWN)..u32::from(OWN) + 1);
             let identity = Identity { run_id: 7, role: Role::Coordinator, index: OWN, generation };

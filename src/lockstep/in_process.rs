@@ -2,7 +2,7 @@
 
 use super::{
     ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Handover, Identity, Ledger,
-    LockstepError, Progress, WorldDriver, WorldPorts,
+    LockstepError, Members, Progress, WorldDriver, WorldPorts,
 };
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
@@ -12,7 +12,7 @@ use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::memory::{MemoryFrame, MemoryInbox, MemoryOutbox, MemoryService};
 use crate::transport::{Frame, Inbox};
 use crate::world::World;
-use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::sync::Arc;
 
 type WorldSide = WorldDriver<
@@ -26,9 +26,14 @@ type CoordinatorSide = CoordinatorDriver<
     MemoryInbox<ZoneSummary>,
     MemoryOutbox<ZoneSummary>,
     MemoryOutbox<Assignment>,
+    MemoryInbox<Member>,
 >;
-type ControllerSide =
-    ControllerDriver<MemoryInbox<VehicleState>, MemoryInbox<Assignment>, MemoryOutbox<VehicleCommand>>;
+type ControllerSide = ControllerDriver<
+    MemoryInbox<VehicleState>,
+    MemoryInbox<Assignment>,
+    MemoryOutbox<VehicleCommand>,
+    MemoryInbox<Member>,
+>;
 
 /// World, coordinators and controllers of a run, in one thread.
 #[derive(Debug)]
@@ -86,22 +91,21 @@ impl InProcess {
         let scenario = &world.scenario().clone();
         let zones = scenario.network.zones.len() as u32;
         let run_id = InProcess::RUN_ID;
-        let mut state = MemoryService::new();
-        let mut coordination = MemoryService::new();
-        let mut command = MemoryService::new();
-        let mut coordinator_states: Vec<MemoryService<VehicleState>> =
+        let state = MemoryService::new();
+        let coordination = MemoryService::new();
+        let command = MemoryService::new();
+        let coordinator_states: Vec<MemoryService<VehicleState>> =
             (0..coordinators).map(|_| MemoryService::new()).collect();
-        let mut summaries: Vec<MemoryService<ZoneSummary>> =
+        let summaries: Vec<MemoryService<ZoneSummary>> =
             (0..coordinators).map(|_| MemoryService::new()).collect();
-        // All inboxes before any outbox.
         let controller_inboxes: Vec<_> =
             (0..controllers).map(|_| (state.inbox(), coordination.inbox())).collect();
         let coordinator_inboxes: Vec<_> =
-            coordinator_states.iter_mut().zip(&mut summaries).map(|(c, s)| (c.inbox(), s.inbox())).collect();
+            coordinator_states.iter().zip(&summaries).map(|(c, s)| (c.inbox(), s.inbox())).collect();
         let command_inbox = command.inbox();
         let observer = observed.then(|| Observer {
             state: state.tap(),
-            summaries: summaries.iter_mut().map(MemoryService::tap).collect(),
+            summaries: summaries.iter().map(MemoryService::tap).collect(),
             coordination: coordination.tap(),
             command: command.tap(),
         });
@@ -120,6 +124,7 @@ impl InProcess {
                     summaries: inbox,
                     neighbours,
                     coordination: coordination.outbox(),
+                    members: Members::as_claimed(),
                 };
                 let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
                 CoordinatorDriver::new(role, ports, identity(Role::Coordinator, index))
@@ -129,7 +134,8 @@ impl InProcess {
             .into_iter()
             .zip(0..)
             .map(|((state, coordination), index)| {
-                let ports = ControllerPorts { state, coordination, command: command.outbox() };
+                let (command, members) = (command.outbox(), Members::as_claimed());
+                let ports = ControllerPorts { state, coordination, command, members };
                 let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, controllers));
                 ControllerDriver::new(role, ports, identity(Role::Controller, index), 0)
             })

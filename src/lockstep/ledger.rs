@@ -37,6 +37,9 @@ pub struct Handover {
     pub fresh: Vec<ZoneSummary>,
     /// To a coordinator: bit per coordinator process that has an event in that step, and so sends summaries.
     pub events: u64,
+    /// To a coordinator: bit per coordinator process that had an event in the step before, and so sent summaries
+    /// then, which may have gone with it.
+    pub summarised: u64,
 }
 
 impl Handover {

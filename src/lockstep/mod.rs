@@ -8,14 +8,16 @@ mod controller;
 mod coordinator;
 pub mod in_process;
 mod ledger;
+mod members;
 mod refusals;
 mod world;
 
 pub use controller::{ControllerDriver, ControllerPorts};
 pub use coordinator::{CoordinatorDriver, CoordinatorPorts};
 pub use ledger::{Handover, Ledger};
+pub use members::{Members, Seat};
 pub use refusals::{Refusal, RefusedFrames};
-pub use world::{Seat, WorldDriver, WorldPorts};
+pub use world::{WorldDriver, WorldPorts};
 
 use crate::control::pool::PoolError;
 use crate::scenario::ControllerNames;

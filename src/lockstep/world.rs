@@ -1,9 +1,10 @@
 //! The world's side of a step: publish the state, collect the commands, integrate.
 
-use super::refusals::{Claim, Refusals};
+use super::members::check_sender;
+use super::refusals::Refusals;
 use super::{
-    Awaited, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal, RefusedFrames, mask_of,
-    sender,
+    Awaited, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal, RefusedFrames, Seat,
+    mask_of,
 };
 use crate::scenario::ControllerNames;
 use crate::scenario::share::zones_of;
@@ -11,7 +12,7 @@ use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots};
 use crate::world::{Sheet, World};
 use ipc_schemas::{
-    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, HeaderFault, Role, VehicleCommand,
+    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, Member, Role, VehicleCommand,
     VehicleState, ZoneSummary,
 };
 
@@ -27,24 +28,6 @@ pub struct WorldPorts<S, C, M, A> {
     /// Coordination, as controllers get it. With it the world keeps a [`Ledger`]; without, nobody can be
     /// replaced.
     pub coordination: Option<A>,
-}
-
-/// A place among the processes of a role.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Seat {
-    /// How often it has been taken anew.
-    pub generation: u32,
-    /// Who has it, where that is known; frames from others are refused then.
-    pub process_id: Option<u32>,
-    /// The sending end that has proved to be that process's.
-    origin: Option<u128>,
-}
-
-impl Seat {
-    /// A place taken for the `generation`th time.
-    pub fn new(generation: u32, process_id: u32) -> Seat {
-        Seat { generation, process_id: Some(process_id), origin: None }
-    }
 }
 
 /// Drives a [`World`] through the lockstep.
@@ -215,12 +198,43 @@ where
         self.refusals.late
     }
 
-    /// Gives a place to a process; frames its predecessor has left are refused from now on.
-    pub fn seat(&mut self, role: Role, index: u32, seat: Seat) {
+    /// Gives a place to a process; frames its predecessor has left are refused from now on. Returns whether it
+    /// had not had it.
+    pub fn seat(&mut self, role: Role, index: u32, seat: Seat) -> bool {
         let seats = if role == Role::Coordinator { &mut self.coordinators } else { &mut self.controllers };
-        if let Some(place) = seats.get_mut(index as usize) {
-            *place = seat;
+        let who = |seat: &Seat| (seat.generation, seat.process_id);
+        let place = seats.get_mut(index as usize).filter(|place| who(place) != who(&seat));
+        place.map(|place| *place = seat).is_some()
+    }
+
+    /// Who has which place, as everybody is to know.
+    pub fn members(&self) -> impl Iterator<Item = Member> {
+        let roles = [(Role::Coordinator, &self.coordinators), (Role::Controller, &self.controllers)];
+        roles.into_iter().flat_map(|(role, seats)| {
+            seats.iter().zip(0..).filter_map(move |(seat, index)| {
+                let (role, generation) = (role as u16, seat.generation);
+                Some(Member { process_id: seat.process_id?, generation, role, index })
+            })
+        })
+    }
+
+    /// Who is still there to receive states: role, index and process. After the end of the run the world must
+    /// not leave before them, for the last state would go with it.
+    pub fn receivers(&self) -> Vec<(Role, u32, u32)> {
+        let mut receivers = Vec::new();
+        let mut add = |role, seats: &[Seat], first: u32, process_id: Option<u32>| {
+            let is_there = |seat: &Seat| seat.process_id.is_some() && seat.process_id == process_id;
+            if let Some((_, index)) = seats.iter().zip(first..).find(|(seat, _)| is_there(seat)) {
+                receivers.extend(process_id.map(|id| (role, index, id)));
+            }
+        };
+        for (index, outbox) in (0..).zip(&self.ports.coordinator_states) {
+            let seats = &self.coordinators[index as usize..][..1];
+            outbox.receivers(&mut |process_id| add(Role::Coordinator, seats, index, process_id));
         }
+        let seats = &self.controllers[..];
+        self.ports.state.receivers(&mut |process_id| add(Role::Controller, seats, 0, process_id));
+        receivers
     }
 
     /// Who is waited for and has sent something it should not have in this step: its name and the fault.
@@ -254,8 +268,13 @@ where
             }
             _ => {}
         }
-        if let Phase::Collect(_) = self.phase {
-            handover.events = self.world.coordinators_with_events();
+        match self.phase {
+            Phase::Collect(_) => {
+                handover.events = self.world.coordinators_with_events();
+                handover.summarised = self.header.coordinators_summarised;
+            }
+            // Those with an event in the step that has just ended.
+            _ => handover.summarised = self.world.coordinators_with_events(),
         }
         Some(handover)
     }
@@ -517,44 +536,4 @@ fn copy_out<R: Copy>(copy: &mut Vec<R>, records: &[R]) {
         copy.reserve(records.len().next_power_of_two());
     }
     copy.extend_from_slice(records);
-}
-
-/// Checks the header of an answer, that its sender has the place it claims, and that it is still asked for.
-/// An answer that is merely late or comes twice is an error without a refusal.
-fn check_sender<R: ipc_schemas::Record, I: Inbox<R>>(
-    expected: &ExpectedHeader,
-    (header, records, origin): (&FrameHeader, usize, u128),
-    seat: Option<&mut Seat>,
-    missing: u64,
-    inbox: &I,
-) -> Result<(), Option<Refusal>> {
-    let checked = expected.check(header, records);
-    let late = match &checked {
-        Ok(()) => header.sender_index < 64 && missing >> header.sender_index & 1 == 0,
-        Err(HeaderFault::OldGeneration { .. }) => true,
-        Err(HeaderFault::OtherStep { expected, found }) => found < expected,
-        Err(_) => false,
-    };
-    if let (Err(fault), false) = (checked, late) {
-        return Err(Some(fault.into()));
-    }
-    let Some(seat) = seat else { return Err(Some(Refusal::Unexpected { step: header.step })) };
-    if let Some(process_id) = seat.process_id.filter(|_| seat.origin != Some(origin)) {
-        match inbox.process_of(origin) {
-            Some(found) if found != process_id => {
-                return Err(Some(Refusal::Stranger { claimed: Claim::of(header), expected: process_id }));
-            }
-            // It has died since; its successor will answer.
-            None => return Err(None),
-            Some(_) => seat.origin = Some(origin),
-        }
-    }
-    if late { Err(None) } else { Ok(()) }
-}
-
-/// Checks a state frame as its receivers do; the step is their business.
-pub(super) fn check_state(run_id: u64, header: &FrameHeader, records: usize) -> Result<(), LockstepError> {
-    ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
-        .check(header, records)
-        .map_err(|fault| LockstepError::Header { sender: sender(header), fault })
 }

@@ -2,7 +2,7 @@
 
 use super::attach::{Readiness, Reception};
 use super::pace::Pacer;
-use super::services::Driver;
+use super::services::{Driver, MembersDesk};
 use super::{OnMiss, Peer, Peers, ProcessError, Replacement, StopFlag, Waiter};
 use crate::lockstep::Awaited;
 use ipc_schemas::Role;
@@ -19,6 +19,7 @@ const ATTEND_AFTER: Duration = Duration::from_millis(1);
 #[derive(Debug)]
 pub(super) struct House {
     pub reception: Reception,
+    pub members: MembersDesk,
     pub replace: bool,
     pub pacer: Pacer,
     /// The step's deadline has passed, and this is the verdict of what is put in for whoever is missing.
@@ -110,17 +111,23 @@ impl House {
 
     /// Sees to whoever has come.
     pub(super) fn attend(&mut self, driver: &mut Driver, waiter: &mut Waiter) -> Result<(), ProcessError> {
-        let House { reception, arrived, gone, .. } = self;
+        let House { reception, members, arrived, gone, .. } = self;
         reception.go_on_from(driver.world().step());
         let before = arrived.len();
+        let step = driver.world().step();
+        let mut told = Ok(());
         reception.serve(&mut |role, index, seat| {
-            driver.seat(role, index, seat);
+            if driver.seat(role, index, seat) {
+                // Before it is answered, and so before it can send anything.
+                told = members.tell(step, driver.members());
+            }
             let Some(handover) = driver.handover(role, index) else { return Readiness::Later };
             if let Some(process_id) = seat.process_id {
                 arrived.push((Peer { role, index, process_id }, seat.generation));
             }
             Readiness::Now(Box::new(handover))
         })?;
+        told?;
         if arrived.len() > before {
             *gone = None;
             waiter.set_peers(reception.peers());

@@ -33,8 +33,8 @@ pub use services::expected_vehicles;
 pub use stop::{StopFlag, signals_to_heed};
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
-    WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process, run_in_process_observed,
-    run_on_in_process, run_world,
+    Departure, WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process,
+    run_in_process_observed, run_on_in_process, run_world,
 };
 
 use crate::lockstep::LockstepError;

@@ -7,12 +7,14 @@ use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::lockstep::{
     ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Handover, Identity,
-    LockstepError, Progress, RefusedFrames,
+    LockstepError, Members, Progress, RefusedFrames,
 };
 use crate::scenario::share::{neighbour_coordinators, zones_of};
-use crate::transport::iox::{RunName, RunSpace};
+use crate::transport::iox::{IoxInbox, RunName, RunSpace};
 use crate::transport::{Inbox, Outbox};
-use ipc_schemas::{self as frames, Assignment, AttachReply, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{
+    self as frames, Assignment, AttachReply, Member, Role, VehicleCommand, VehicleState, ZoneSummary,
+};
 use std::time::Duration;
 
 /// How long a coordinator waits for the next event. Events may be far apart in a paced run; a world that
@@ -61,6 +63,7 @@ pub fn run_coordinator(
             .open(frames::SERVICE_COORDINATION)?
             .outbox(2 * expected_vehicles(scenario))?
             .ringing(controller_ropes(bells, wait, controllers)),
+        members: members(&space, &attachment.reply)?,
     };
     let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
     let identity = identity(&attachment.reply, Role::Coordinator);
@@ -101,15 +104,15 @@ pub fn run_controller(
     // Plug-ins come behind the processes of the pool.
     let pool = controllers - scenario.plugins.len() as u32;
     let zones = scenario.network.zones.len() as u32;
-    let ports =
-        ControllerPorts {
-            state: space.open(frames::SERVICE_STATE)?.inbox()?,
-            coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
-            command: space
-                .open(frames::SERVICE_COMMAND)?
-                .outbox(expected_vehicles(scenario))?
-                .ringing(rope_of(bells, wait, Role::World, 0)),
-        };
+    let ports = ControllerPorts {
+        state: space.open(frames::SERVICE_STATE)?.inbox()?,
+        coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
+        command: space
+            .open(frames::SERVICE_COMMAND)?
+            .outbox(expected_vehicles(scenario))?
+            .ringing(rope_of(bells, wait, Role::World, 0)),
+        members: members(&space, &attachment.reply)?,
+    };
     let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
     let identity = identity(&attachment.reply, Role::Controller);
     let mut driver = ControllerDriver::new(role, ports, identity, first_step);
@@ -125,12 +128,13 @@ pub fn run_controller(
     end
 }
 
-impl<S, N, O, A> Participant for CoordinatorDriver<S, N, O, A>
+impl<S, N, O, A, M> Participant for CoordinatorDriver<S, N, O, A, M>
 where
     S: Inbox<VehicleState>,
     N: Inbox<ZoneSummary>,
     O: Outbox<ZoneSummary>,
     A: Outbox<Assignment>,
+    M: Inbox<Member>,
 {
     fn advance(&mut self) -> Result<Progress, LockstepError> {
         self.advance()
@@ -141,11 +145,12 @@ where
     }
 }
 
-impl<S, A, C> Participant for ControllerDriver<S, A, C>
+impl<S, A, C, M> Participant for ControllerDriver<S, A, C, M>
 where
     S: Inbox<VehicleState>,
     A: Inbox<Assignment>,
     C: Outbox<VehicleCommand>,
+    M: Inbox<Member>,
 {
     fn advance(&mut self) -> Result<Progress, LockstepError> {
         self.advance()
@@ -158,4 +163,10 @@ where
 
 fn identity(reply: &AttachReply, role: Role) -> Identity {
     Identity { run_id: reply.run_id, role, index: reply.index as u16, generation: reply.generation }
+}
+
+/// Whom to believe, as the world says.
+fn members(space: &RunSpace, reply: &AttachReply) -> Result<Members<IoxInbox<Member>>, ProcessError> {
+    let inbox = space.open(frames::SERVICE_MEMBERS)?.inbox()?;
+    Ok(Members::told_by(reply.world_process_id, inbox))
 }

@@ -31,6 +31,11 @@ impl Peer {
             _ => self.to_string(),
         }
     }
+
+    /// Whether it is still there.
+    pub(super) fn is_alive(&self) -> bool {
+        is_alive(self.process_id)
+    }
 }
 
 /// The processes somebody depends on.
@@ -40,7 +45,7 @@ pub struct Peers(pub Vec<Peer>);
 impl Peers {
     /// The first peer that is no longer alive.
     pub fn first_gone(&self) -> Option<Peer> {
-        self.0.iter().copied().find(|peer| !is_alive(peer.process_id))
+        self.0.iter().copied().find(|peer| !peer.is_alive())
     }
 }
 

@@ -6,17 +6,18 @@
 //! breaks and replaced, so that one fault does not hide the others.
 
 use super::attach::{Readiness, Reception};
+use super::services::MembersDesk;
 use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::lockstep::Handover;
 use crate::scenario::Scenario;
 use crate::transport::iox::{IoxFrame, IoxInbox, IoxOutbox, RunName, RunSpace, ServiceLimits};
-use crate::transport::{Frame, Inbox, Loan, Outbox};
+use crate::transport::{Backlog, Frame, Inbox, Loan, Outbox};
 use crate::world::{CommandFault, World};
 use hdrhistogram::Histogram;
 use ipc_schemas::{
-    self as frames, Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault, Role,
+    self as frames, Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault, Member, Role,
     VehicleCommand, VehicleState,
 };
 use rustix::process::{Pid, Signal, kill_process_group};
@@ -169,10 +170,14 @@ pub fn check(
 ) -> Result<Report, ProcessError> {
     let run: RunName = format!("check-{}", std::process::id()).parse().expect("letters, a dash and digits");
     let space = RunSpace::enter(&run)?;
-    let limits = |publishers, subscribers| ServiceLimits { publishers, subscribers, nodes: 6 };
+    let limits = |publishers, subscribers| {
+        let backlog = Backlog::STEPS;
+        ServiceLimits { publishers, subscribers, nodes: 6, backlog }
+    };
     let state = space.create(frames::SERVICE_STATE, limits(1, 3))?;
     let coordination = space.create(frames::SERVICE_COORDINATION, limits(1, 3))?;
     let commands = space.create(frames::SERVICE_COMMAND, limits(3, 1))?;
+    let members = space.create(frames::SERVICE_MEMBERS, MembersDesk::limits(3, 6))?;
     let run_id = 0x636f_6e66_6f72_6d00 | u64::from(std::process::id() & 0xff);
     let mut world = World::new(scenario.clone(), 1);
     world.share_out(INDEX + 1);
@@ -182,6 +187,7 @@ pub fn check(
         state: state.outbox(256)?,
         coordination: coordination.outbox(512)?,
         commands: commands.inbox()?,
+        members: MembersDesk::open(&members, run_id)?,
         coordinator: Coordinator::new(scenario.clone(), zones.clone()),
         in_force: zones.clone().map(|_| Vec::new()).collect(),
         pool: ControllerPool::new(scenario.clone(), zones),
@@ -218,6 +224,7 @@ struct Kit<'a> {
     state: IoxOutbox<VehicleState>,
     coordination: IoxOutbox<Assignment>,
     commands: IoxInbox<VehicleCommand>,
+    members: MembersDesk,
     coordinator: Coordinator,
     /// By zone.
     in_force: Vec<Vec<Assignment>>,
@@ -305,6 +312,10 @@ impl Kit<'_> {
             }
             std::thread::sleep(Duration::from_millis(1));
         }
+        // The coordinator is in this process, and so is its sending end.
+        let own =
+            Member { process_id: std::process::id(), role: frames::ROLE_COORDINATOR, ..Member::default() };
+        self.members.tell(self.world.step(), [own].into_iter())?;
         Ok(true)
     }
 

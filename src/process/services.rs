@@ -1,13 +1,14 @@
 //! The services of a run, as its world creates them, and whose bells are rung with them.
 
 use super::WaitMode;
-use crate::lockstep::{WorldDriver, WorldPorts};
+use crate::lockstep::{Identity, WorldDriver, WorldPorts};
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
 use crate::transport::iox::{
     BellRope, Bells, IoxInbox, IoxOutbox, RunSpace, Service, ServiceLimits, SpaceError,
 };
-use ipc_schemas::{self as frames, Assignment, Role, VehicleCommand, VehicleState, ZoneSummary};
+use crate::transport::{Backlog, Loan, Outbox, Slots, TransportError};
+use ipc_schemas::{self as frames, Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
 
 /// The world's ends of the services.
 pub(super) type Ports = WorldPorts<
@@ -27,6 +28,10 @@ pub(super) type Driver = WorldDriver<
 /// Room for sending ends that belong to nobody in the run: what they send is counted and refused.
 const STRANGERS: usize = 2;
 
+/// Summaries of one sender that may wait: of the step before and of this one, of the next from a neighbour that is
+/// quicker, and one more that is sent again by whoever takes its place.
+const SUMMARIES: Backlog = Backlog::Bounded(4);
+
 /// All frame services of a run, created by its world and kept open by it.
 #[derive(Debug)]
 pub(super) struct Services {
@@ -36,8 +41,41 @@ pub(super) struct Services {
     coordination: Service<Assignment>,
     /// Whether the world listens to coordination too.
     keeps: bool,
+    members: Service<Member>,
     _summaries: Vec<Service<ZoneSummary>>,
     controllers: u32,
+}
+
+/// The world's word on who has which place.
+#[derive(Debug)]
+pub(super) struct MembersDesk {
+    outbox: IoxOutbox<Member>,
+    run_id: u64,
+}
+
+impl MembersDesk {
+    /// Opens it.
+    pub(super) fn open(service: &Service<Member>, run_id: u64) -> Result<MembersDesk, SpaceError> {
+        Ok(MembersDesk { outbox: service.outbox(8)?, run_id })
+    }
+
+    /// How many may listen to it, and what they get: only the last word counts.
+    pub(super) fn limits(subscribers: usize, nodes: usize) -> ServiceLimits {
+        ServiceLimits { publishers: 1, subscribers, nodes, backlog: Backlog::Last }
+    }
+
+    /// Tells everybody, before a step.
+    pub(super) fn tell(
+        &mut self,
+        step: u64,
+        members: impl Iterator<Item = Member>,
+    ) -> Result<(), TransportError> {
+        let world = Identity { run_id: self.run_id, role: Role::World, index: 0, generation: 0 };
+        let members: Vec<Member> = members.collect();
+        let fill = |slots: &mut Slots<'_, Member>| members.iter().for_each(|m| slots.push(*m));
+        self.outbox.loan(world.header(step, 0), members.len(), fill)?.send()?;
+        Ok(())
+    }
 }
 
 impl Services {
@@ -50,7 +88,10 @@ impl Services {
         let (m, n) = (coordinators as usize, controllers as usize);
         // Strangers may try; they shall not keep anybody out who belongs here.
         let nodes = 1 + m + n + STRANGERS;
-        let limits = |publishers, subscribers| ServiceLimits { publishers, subscribers, nodes };
+        let limits = |publishers, subscribers| {
+            let backlog = Backlog::STEPS;
+            ServiceLimits { publishers, subscribers, nodes, backlog }
+        };
         let masks = neighbour_coordinators(&scenario.network, coordinators);
         Ok(Services {
             controllers,
@@ -65,15 +106,20 @@ impl Services {
             coordination: space
                 .create(frames::SERVICE_COORDINATION, limits(m + STRANGERS, n + usize::from(keeps)))?,
             keeps,
+            members: space.create(frames::SERVICE_MEMBERS, MembersDesk::limits(m + n, nodes))?,
             _summaries: (0..m)
                 .map(|i| {
                     let name = format!("{}{i}", frames::SERVICE_SUMMARY_PREFIX);
-                    space.create(&name, limits((masks[i].count_ones() as usize).max(1), 1))
+                    let neighbours = masks[i].count_ones() as usize;
+                    let limits = limits(neighbours + STRANGERS, 1);
+                    space.create(&name, ServiceLimits { backlog: SUMMARIES, ..limits })
                 })
                 .collect::<Result<_, _>>()?,
         })
     }
 
+    /// The world's ends. Opened before anybody can join, they are there to be connected to, and nobody else
+    /// takes the one place for a sender of states.
     pub(super) fn world_ports(
         &self,
         bells: &Bells,
@@ -92,6 +138,11 @@ impl Services {
             command: self.command.inbox()?,
             coordination: if self.keeps { Some(self.coordination.inbox()?) } else { None },
         })
+    }
+
+    /// The world's word on who has which place.
+    pub(super) fn members_desk(&self, run_id: u64) -> Result<MembersDesk, SpaceError> {
+        MembersDesk::open(&self.members, run_id)
     }
 }
 

@@ -7,7 +7,7 @@ use super::outcome::{History, Outcome, StepMeter};
 use super::pace::Pacer;
 use super::peers::is_alive;
 use super::placement::number_of_cores;
-use super::services::{Services, expected_vehicles};
+use super::services::{Driver, Services, expected_vehicles};
 use super::{Pace, Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Handover, Ledger, Progress, Seat, WorldDriver};
@@ -83,8 +83,40 @@ pub fn new_run_id() -> u64 {
     u64::from_le_bytes(id)
 }
 
+/// The world of a run that is over, on its way out. What it has sent last goes with it, so it leaves when all
+/// the others have.
+#[derive(Debug)]
+#[must_use = "the world leaves last"]
+pub struct Departure {
+    // Dropped in this order: ends, services, space.
+    driver: Driver,
+    patience: Duration,
+    _services: Services,
+    _space: RunSpace,
+}
+
+/// Time between two looks for those who are still there.
+const LEAVE_LOOK: Duration = Duration::from_micros(200);
+
+impl Departure {
+    /// Waits until everybody has left the services or died, as long as for a frame; returns who has not.
+    pub fn wait(self, stop: &StopFlag) -> Vec<Peer> {
+        let mut bound = Bound::of(self.patience);
+        loop {
+            let peer = |(role, index, process_id)| Peer { role, index, process_id };
+            let mut there: Vec<Peer> = self.driver.receivers().into_iter().map(peer).collect();
+            there.retain(Peer::is_alive);
+            if there.is_empty() || stop.is_set() || bound.is_over() {
+                return there;
+            }
+            std::thread::sleep(LEAVE_LOOK);
+        }
+    }
+}
+
 /// Runs the world of a multi-process run to its end, on from so many steps of a recording if there is one;
-/// `progress` is called now and then.
+/// `progress` is called now and then. Once the outcome has been put where it belongs, the departure is to be
+/// waited for.
 pub fn run_world(
     scenario: &Arc<Scenario>,
     options: &WorldOptions,
@@ -92,7 +124,7 @@ pub fn run_world(
     settling: &Settling<'_>,
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
-) -> Result<Outcome, ProcessError> {
+) -> Result<(Outcome, Departure), ProcessError> {
     // First of all: it may take a while, and may fail.
     let world = match resume {
         Some((reader, steps)) => replay_world(reader, steps)?,
@@ -135,6 +167,8 @@ pub fn run_world(
         false => None,
     };
     let bells = space.create_bells()?;
+    let ports = services.world_ports(&bells, scenario, wait)?;
+    let mut members = services.members_desk(run_id)?;
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
     let bell = rung.then(|| bells.bell(Role::World, 0));
@@ -148,7 +182,6 @@ pub fn run_world(
         Some(Handover { step: first_step, ..ledger.handover(role, index) })
     };
     receive_all(&mut reception, &handed, observed.as_ref(), options, stop)?;
-    let ports = services.world_ports(&bells, scenario, wait)?;
     space.check_room()?;
 
     let mut driver = WorldDriver::new(world, ports, run_id, controllers);
@@ -165,8 +198,10 @@ pub fn run_world(
     for Peer { role, index, process_id } in reception.peers().0 {
         driver.seat(role, index, Seat::new(0, process_id));
     }
+    members.tell(first_step, driver.members())?;
     let mut house = House {
         reception,
+        members,
         replace: options.replace,
         pacer: Pacer::new(options.timing, scenario.dt_ns),
         overdue: None,
@@ -189,7 +224,10 @@ pub fn run_world(
                 history.punctuality = house.pacer.report(&driver.names());
                 history.refused = driver.refused();
                 history.late_frames = driver.late_frames();
-                return Ok(meter.outcome(driver.world(), history));
+                let outcome = meter.outcome(driver.world(), history);
+                let patience = options.peer_timeout;
+                let departure = Departure { driver, patience, _services: services, _space: space };
+                return Ok((outcome, departure));
             }
             Progress::Waiting(awaited) => house.wait(&mut driver, &mut waiter, awaited)?,
             Progress::Behind => unreachable!("the world is where the run is"),

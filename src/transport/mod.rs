@@ -9,6 +9,28 @@ pub mod memory;
 use ipc_schemas::{FrameHeader, Record};
 use std::mem::MaybeUninit;
 
+/// What becomes of frames that are not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Backlog {
+    /// So many of one sender wait for their receiver; a further one does not reach it.
+    Bounded(usize),
+    /// The last one waits; it drives out the one before.
+    Last,
+}
+
+impl Backlog {
+    /// In lockstep one frame is being read while the next arrives.
+    pub const STEPS: Backlog = Backlog::Bounded(2);
+
+    /// How many frames of a sender may wait.
+    pub fn frames(self) -> usize {
+        match self {
+            Backlog::Bounded(frames) => frames,
+            Backlog::Last => 1,
+        }
+    }
+}
+
 /// The sending end of a service.
 pub trait Outbox<R: Record> {
     /// A frame being written.
@@ -27,6 +49,10 @@ pub trait Outbox<R: Record> {
         count: usize,
         fill: impl FnOnce(&mut Slots<'_, R>),
     ) -> Result<Self::Loan<'_>, TransportError>;
+
+    /// Visits every receiving end that is open, with the process it belongs to where the transport knows.
+    /// What has been sent is safe from its sender's leaving once a receiver has taken it, not before.
+    fn receivers(&self, _visit: &mut dyn FnMut(Option<u32>)) {}
 }
 
 /// A frame that has been written and not yet sent; dropped, it is never seen.
@@ -44,7 +70,8 @@ pub trait Inbox<R: Record> {
     type Frame: Frame<R>;
 
     /// The next frame, if there is one. Frames of one sender come in order; a sender two of whose frames
-    /// are still held is passed over.
+    /// are still held is passed over. What a sender has left that is gone by now comes only if this end
+    /// has taken a frame of it before.
     fn receive(&mut self) -> Result<Option<Self::Frame>, TransportError>;
 
     /// The process behind a frame's [`origin`](Frame::origin), where the transport knows.

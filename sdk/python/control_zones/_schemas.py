@@ -11,7 +11,7 @@ import ctypes
 import sys
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0xfb18d61d5f65d583
+SCHEMA_HASH = 0x3e9f1a13b126324d
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -142,6 +142,9 @@ SERVICE_COORDINATION = "cz/coordination"
 SERVICE_SUMMARY_PREFIX = "cz/summary/"
 #: Controllers → world: `VehicleCommand` of every step.
 SERVICE_COMMAND = "cz/command"
+#: World → coordinators and controllers: `Member`, who has which place. Overflows: only the last
+#: frame counts.
+SERVICE_MEMBERS = "cz/members"
 #: World → whoever records the run: every step as one block of bytes. Overflows, so that nobody
 #: waits for its reader.
 SERVICE_OBSERVER = "cz/observer"
@@ -362,6 +365,34 @@ class VehicleCommand(ctypes.Structure):
         return "cz.VehicleCommand.v1"
 
 
+class Member(ctypes.Structure):
+    """World → coordinators and controllers: the process that has a place in the run.
+
+    A frame lists everybody but the world, and the last one counts. The world sends it before the
+    first state, and again before whoever takes a place anew may send its first frame. A receiver
+    believes a frame of a coordinator only when the transport says that it comes from the process
+    that has its place.
+
+    Fields:
+        process_id: The process.
+        generation: Generation in the headers of its frames.
+        role: 2 coordinator, 3 controller.
+        index: Index among the processes of the role.
+    """
+
+    _fields_ = [
+        ("process_id", ctypes.c_uint32),
+        ("generation", ctypes.c_uint32),
+        ("role", ctypes.c_uint16),
+        ("index", ctypes.c_uint16),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        """Name under which the transport registers the type."""
+        return "cz.Member.v1"
+
+
 class AttachRequest(ctypes.Structure):
     """Participant → world: let me in; later, I am ready.
 
@@ -545,6 +576,7 @@ RECORDS = (
     Assignment,
     ZoneSummary,
     VehicleCommand,
+    Member,
     AttachRequest,
     AttachReply,
     RunSpec,
@@ -558,6 +590,7 @@ TYPE_NAMES = {
     "Assignment": "cz.Assignment.v1",
     "ZoneSummary": "cz.ZoneSummary.v1",
     "VehicleCommand": "cz.VehicleCommand.v1",
+    "Member": "cz.Member.v1",
     "AttachRequest": "cz.AttachRequest.v1",
     "AttachReply": "cz.AttachReply.v1",
     "RunSpec": "cz.RunSpec.v1",
@@ -647,6 +680,16 @@ _LAYOUTS = {
             "binding_rows": 88,
             "mode": 92,
             "verdict": 94,
+        },
+    ),
+    Member: (
+        12,
+        4,
+        {
+            "process_id": 0,
+            "generation": 4,
+            "role": 8,
+            "index": 10,
         },
     ),
     AttachRequest: (

@@ -2,6 +2,7 @@
 
 use super::bell::{BellRope, ring_all};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
+use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::port::{LoanError, ReceiveError};
@@ -20,11 +21,17 @@ pub struct IoxOutbox<R: Record> {
     service: String,
     publisher: Publisher<ipc::Service, [R], FrameHeader>,
     bells: Vec<BellRope>,
+    /// Knows the ports of the service.
+    factory: Rc<Factory<R>>,
 }
 
 impl<R: Record> IoxOutbox<R> {
-    pub(super) fn new(service: String, publisher: Publisher<ipc::Service, [R], FrameHeader>) -> Self {
-        IoxOutbox { service, publisher, bells: Vec::new() }
+    pub(super) fn new(
+        service: String,
+        publisher: Publisher<ipc::Service, [R], FrameHeader>,
+        factory: Rc<Factory<R>>,
+    ) -> Self {
+        IoxOutbox { service, publisher, bells: Vec::new(), factory }
     }
 
     /// Rings these bells after every send.
@@ -56,6 +63,13 @@ impl<R: Record> Outbox<R> for IoxOutbox<R> {
         // SAFETY: `assert_full` has established that all `count` records have been written.
         let sample = unsafe { sample.assume_init() };
         Ok(IoxLoan { service: &self.service, sample, bells: &self.bells })
+    }
+
+    fn receivers(&self, visit: &mut dyn FnMut(Option<u32>)) {
+        self.factory.dynamic_config().list_subscribers(|subscriber| {
+            visit(process_behind(&subscriber.node_id));
+            CallbackProgression::Continue
+        });
     }
 }
 
@@ -131,11 +145,16 @@ impl<R: Record> Inbox<R> for IoxInbox<R> {
             if publisher.publisher_id.value() != origin {
                 return CallbackProgression::Continue;
             }
-            process = publisher.node_id.pid::<ipc::Service>().ok().map(|pid| pid.value() as u32);
+            process = process_behind(&publisher.node_id);
             CallbackProgression::Stop
         });
         process
     }
+}
+
+/// The process a node belongs to.
+fn process_behind(node: &UniqueNodeId) -> Option<u32> {
+    node.pid::<ipc::Service>().ok().map(|pid| pid.value() as u32)
 }
 
 /// A frame where it lies in shared memory.

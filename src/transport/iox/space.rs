@@ -8,7 +8,7 @@ use super::leftovers::sweep_dead_runs;
 use super::place::{Base, Found, Place, Presence, SHARED_MEMORY, shared_memory};
 use super::ports::{Factory, IoxInbox, IoxOutbox};
 use super::watchdog::within_bounds;
-use crate::transport::TransportError;
+use crate::transport::{Backlog, TransportError};
 use iceoryx2::config::Config;
 use iceoryx2::port::BackpressureAction;
 use iceoryx2::port::publisher::Publisher;
@@ -121,7 +121,8 @@ pub(super) fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
     SpaceError::Failed { what: what.to_owned(), reason: format!("{reason:?}{hint}") }
 }
 
-/// How many ports of a service there may be. Each send walks all subscriber slots, so these are tight.
+/// How many ports of a service there may be, and what waits in them. Each send walks all subscriber slots, so
+/// these are tight.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ServiceLimits {
     /// Publishers.
@@ -130,6 +131,8 @@ pub struct ServiceLimits {
     pub subscribers: usize,
     /// Processes.
     pub nodes: usize,
+    /// What a sender's frames may do in a receiver that has not taken them yet.
+    pub backlog: Backlog,
 }
 
 /// An open service of a run.
@@ -152,7 +155,7 @@ impl<R: Record> Service<R> {
             .set_backpressure_handler(|_| BackpressureAction::DiscardData)
             .create()
             .map_err(|e| failed(&format!("create a publisher of {}", self.name), &e))?;
-        Ok(IoxOutbox::new(self.name.clone(), publisher))
+        Ok(IoxOutbox::new(self.name.clone(), publisher, self.factory.clone()))
     }
 
     /// A receiving port.
@@ -185,8 +188,6 @@ const WORLD_BEGINNING: &str = "world.begins";
 const LONGEST_PATH: usize = 136;
 /// Room in shared memory below which no run is begun, bytes.
 const LEAST_ROOM: u64 = 1 << 20;
-/// Frames in flight per connection: in lockstep one is being read while the next arrives.
-const BUFFER: usize = 2;
 /// Frames of one sender a receiver may hold: the world keeps those of this step and of the one before, and
 /// holds on to two bad ones so that others get their turn.
 const BORROWED: usize = 4;
@@ -264,9 +265,9 @@ impl RunSpace {
             .service_builder(&service_name(name)?)
             .publish_subscribe::<[R]>()
             .user_header::<FrameHeader>()
-            .enable_safe_overflow(false)
+            .enable_safe_overflow(limits.backlog == Backlog::Last)
             .history_size(0)
-            .subscriber_max_buffer_size(BUFFER)
+            .subscriber_max_buffer_size(limits.backlog.frames())
             .subscriber_max_borrowed_samples(BORROWED)
             .max_publishers(limits.publishers)
             .max_subscribers(limits.subscribers)
