@@ -103,7 +103,7 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
             }
             if !stopped && sent > 1000 {
                 // Stepping in spite of the flood so far; from now on the world waits for its controller.
-                common::send(controller.id(), Signal::STOP);
+                common::hold(controller.id());
                 stopped = true;
             }
         }
@@ -171,7 +171,7 @@ fn what_a_controller_refuses_is_in_the_summary_and_by_hand_on_stderr() {
         controller.is_some()
     });
     let controller = controller.unwrap();
-    common::send(controller, Signal::STOP);
+    common::hold(controller);
     mislead(&name, || common::send(controller, Signal::CONT), &mut supervisor);
     let output = supervisor.wait_with_output().unwrap();
     assert!(output.status.success(), "{output:?}");
@@ -335,7 +335,7 @@ fn well_formed_frames_of_a_process_without_a_place_steer_nobody() {
     for round in 0..12 {
         // One coordinator is held at its next event, and somebody else is quicker.
         let victim = round % 3;
-        common::send(coordinators[victim].id(), Signal::STOP);
+        common::hold(coordinators[victim].id());
         let step = onlooker.standstill();
         // Empty, it would do for the true one; a controller that took it would know no partner.
         forged[0] += forge(&mut coordination, victim as u16, step, &[]);

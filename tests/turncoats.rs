@@ -145,7 +145,8 @@ fn a_frame_that_changes_after_it_was_judged_changes_nothing() {
         (commands(world, 0.5, world.step() as f64), vec![Assignment { zone: 1, ..Assignment::default() }])
     });
     let false_zone = || vec![Assignment { zone: u32::MAX, ..Assignment::default() }];
-    let lies: [&dyn Fn(&World) -> Vec<VehicleCommand>; 4] = [
+    type Lie<'a> = &'a dyn Fn(&World) -> Vec<VehicleCommand>;
+    let lies: [Lie<'_>; 4] = [
         &|world| commands(world, f64::NAN, f64::NAN),
         &|world| commands(world, 3.0, 1.0),
         &|_| Vec::new(),

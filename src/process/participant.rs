@@ -104,15 +104,16 @@ pub fn run_controller(
     // Plug-ins come behind the processes of the pool.
     let pool = controllers - scenario.plugins.len() as u32;
     let zones = scenario.network.zones.len() as u32;
-    let ports = ControllerPorts {
-        state: space.open(frames::SERVICE_STATE)?.inbox()?,
-        coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
-        command: space
-            .open(frames::SERVICE_COMMAND)?
-            .outbox(expected_vehicles(scenario))?
-            .ringing(rope_of(bells, wait, Role::World, 0)),
-        members: members(&space, &attachment.reply)?,
-    };
+    let ports =
+        ControllerPorts {
+            state: space.open(frames::SERVICE_STATE)?.inbox()?,
+            coordination: space.open(frames::SERVICE_COORDINATION)?.inbox()?,
+            command: space
+                .open(frames::SERVICE_COMMAND)?
+                .outbox(expected_vehicles(scenario))?
+                .ringing(rope_of(bells, wait, Role::World, 0)),
+            members: members(&space, &attachment.reply)?,
+        };
     let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
     let identity = identity(&attachment.reply, Role::Controller);
     let mut driver = ControllerDriver::new(role, ports, identity, first_step);

@@ -297,6 +297,29 @@ pub fn send(process_id: u32, signal: Signal) {
     kill_process(pid, signal).unwrap_or_else(|e| panic!("cannot send {signal:?} to {process_id}: {e}"));
 }
 
+/// Stops a process where it is, but not while it comes or goes: it has the directory of all runs locked then, and
+/// would hold up everybody, whoever is to let it go on among them.
+pub fn hold(process_id: u32) {
+    loop {
+        send(process_id, Signal::STOP);
+        wait_until("the process to stop", || stat(process_id).is_none_or(|fields| fields[0] == "T"));
+        if !comes_or_goes(process_id) {
+            return;
+        }
+        send(process_id, Signal::CONT);
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// Whether a process has the directory of all runs open, as it has while it locks it.
+fn comes_or_goes(process_id: u32) -> bool {
+    let files = std::fs::read_dir(format!("/proc/{process_id}/fd")).into_iter().flatten().flatten();
+    files.filter_map(|file| std::fs::read_link(file.path()).ok()).any(|path| {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        path.is_dir() && (name == "cz" || name.starts_with("cz-"))
+    })
+}
+
 /// The fields of /proc/PID/stat from the state on; `None` when there is no such process or it is a zombie.
 fn stat(process_id: u32) -> Option<Vec<String>> {
     let stat = std::fs::read_to_string(format!("/proc/{process_id}/stat")).ok()?;

@@ -268,12 +268,31 @@ fn lock(fd: &OwnedFd, how: FlockOperation, deadline: Instant, path: &Path) -> Re
                 std::thread::sleep(Duration::from_micros(500));
             }
             Err(Errno::WOULDBLOCK) => {
-                let seconds = LOCK_PATIENCE.as_secs();
-                return Err(unusable(path, &format!("another process has had it locked for {seconds} s")));
+                let (who, seconds) = (holder(fd), LOCK_PATIENCE.as_secs());
+                let who = who.unwrap_or_else(|| "another process".to_owned());
+                return Err(unusable(path, &format!("{who} has had it locked for {seconds} s")));
             }
             Err(error) => return Err(failed(&format!("lock {}", path.display()), &error)),
         }
     }
+}
+
+/// Who has a lock that cannot be had, as far as the kernel tells: not across namespaces of processes, and not on
+/// every file system.
+fn holder(fd: &OwnedFd) -> Option<String> {
+    let stat = fstat(fd).ok()?;
+    let (major, minor) = (rustix::fs::major(stat.st_dev), rustix::fs::minor(stat.st_dev));
+    let file = format!("{major:02x}:{minor:02x}:{}", stat.st_ino);
+    let locks = std::fs::read_to_string("/proc/locks").ok()?;
+    // Number, kind, whether it is advisory, whether it is shared, process, file; who waits has an arrow before the kind.
+    let held = locks.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
+    let process: u32 = held
+        .filter(|lock| lock.get(1) == Some(&"FLOCK") && lock.get(5) == Some(&file.as_str()))
+        .find_map(|lock| lock.get(4)?.parse().ok())?;
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap_or_default();
+    // The state follows the name, which is in parentheses and may hold any character.
+    let is_stopped = stat.rsplit(')').next().is_some_and(|fields| fields.trim_start().starts_with('T'));
+    Some(format!("process {process}{}", if is_stopped { ", which is stopped," } else { "" }))
 }
 
 /// The marker in a run's directory, and the instance in it, if they are ours and as they should be.
@@ -380,4 +399,40 @@ pub(super) fn is_directory(path: &Path) -> bool {
 
 pub(super) fn file_name(path: &Path) -> String {
     path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn open(path: &Path) -> OwnedFd {
+        openat(CWD, path, OFlags::DIRECTORY | OFlags::RDONLY | NO_LINK, Mode::empty()).unwrap()
+    }
+
+    #[test]
+    fn whoever_holds_a_lock_for_too_long_is_named() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path();
+        let (ours, theirs) = (open(path), open(path));
+        let take = |fd: &OwnedFd| {
+            let exclusive = FlockOperation::NonBlockingLockExclusive;
+            lock(fd, exclusive, Instant::now(), path).map_err(|e| e.to_string())
+        };
+        assert_eq!(take(&ours), Ok(true));
+        let said = take(&theirs).unwrap_err();
+        let us = std::process::id();
+        assert!(said.contains(&format!(": process {us} has had it locked for 5 s")), "{said}");
+
+        drop(ours);
+        let mut child = std::process::Command::new("flock");
+        let mut child = child.arg(path).args(["sh", "-c", "kill -STOP $PPID"]).spawn().unwrap();
+        let stat = format!("/proc/{}/stat", child.id());
+        while !std::fs::read_to_string(&stat).unwrap().contains(") T ") {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let said = take(&theirs).unwrap_err();
+        child.kill().unwrap();
+        child.wait().unwrap();
+        assert!(said.contains(&format!(": process {}, which is stopped, has had it", child.id())), "{said}");
+    }
 }
