@@ -47,8 +47,8 @@ type ControllerSide = ControllerDriver<
 
 #[derive(Debug)]
 enum Driver {
-    Coordinator(CoordinatorSide),
-    Controller(ControllerSide),
+    Coordinator(Box<CoordinatorSide>),
+    Controller(Box<ControllerSide>),
 }
 
 impl Driver {
@@ -137,7 +137,7 @@ impl Services {
                 members,
             };
             let pool = ControllerPool::new(self.scenario.clone(), own(CONTROLLERS));
-            return Driver::Controller(ControllerDriver::new(pool, ports, identity, 0));
+            return Driver::Controller(Box::new(ControllerDriver::new(pool, ports, identity, 0)));
         }
         let mask = neighbour_coordinators(&self.scenario.network, COORDINATORS)[index as usize];
         let to = |n: u32| {
@@ -151,7 +151,7 @@ impl Services {
             members,
         };
         let coordinator = Coordinator::new(self.scenario.clone(), own(COORDINATORS));
-        Driver::Coordinator(CoordinatorDriver::new(coordinator, ports, identity))
+        Driver::Coordinator(Box::new(CoordinatorDriver::new(coordinator, ports, identity)))
     }
 
     fn world(&self) -> WorldSide {

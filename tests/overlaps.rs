@@ -161,7 +161,7 @@ fn drive(scenario: &Arc<Scenario>, seed: u64) -> (OverlapSummary, Oracle) {
         let commands: Vec<VehicleCommand> = members
             .map(|s| {
                 let draw =
-                    (seed ^ u64::from(s.vehicle) << 32 ^ step / 12).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+                    (seed ^ (u64::from(s.vehicle) << 32) ^ (step / 12)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
                 let draw = (draw ^ draw >> 29).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 40;
                 let wish = draw as f64 / f64::from(1u32 << 24) * 8.0 - 4.0;
                 let u_mps2 = if s.v_mps < 3.0 { wish.abs() } else { wish.min((25.0 - s.v_mps) / DT_S) };

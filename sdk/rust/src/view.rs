@@ -336,8 +336,11 @@ mod tests {
         all
     }
 
-    /// What a search through the whole frame finds: vehicle, length, and partners with their positions.
-    fn searched(run: &Run, states: &[VehicleState], all: &[Assignment]) -> Vec<(u32, f64, Vec<(u32, f64)>)> {
+    /// Vehicle, length, and partners with their positions.
+    type Seen = (u32, f64, Vec<(u32, f64)>);
+
+    /// What a search through the whole frame finds.
+    fn searched(run: &Run, states: &[VehicleState], all: &[Assignment]) -> Vec<Seen> {
         let own = states.iter().filter(|s| s.flags & STATE_LEFT == 0 && run.drives(s.zone, s.path));
         own.map(|s| {
             let its = all.iter().filter(|a| (a.zone, a.vehicle) == (s.zone, s.vehicle));
@@ -351,7 +354,7 @@ mod tests {
         .collect()
     }
 
-    fn seen(run: &Run, states: &[VehicleState], board: &Board) -> Vec<(u32, f64, Vec<(u32, f64)>)> {
+    fn seen(run: &Run, states: &[VehicleState], board: &Board) -> Vec<Seen> {
         let header = FrameHeader::default();
         let step = Step { header: &header, time_s: 0.0, states, run, board };
         let partners = |v: &Vehicle<'_>| v.partners().map(|p| (p.state.vehicle, p.x_m)).collect();
