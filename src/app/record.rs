@@ -174,9 +174,15 @@ fn is_same_file(a: &Path, b: &Path) -> bool {
     identity(a).is_some_and(|a| Some(a) == identity(b))
 }
 
-/// A recording, or why it cannot be read.
+/// A recording, or why it cannot be read. When another build has written it, that is said.
 pub(super) fn open(path: &Path) -> Result<Reader<FileSource>, AppError> {
-    Reader::open(path).map_err(|error| AppError::Usage(format!("{}: {error}", path.display())))
+    let reader =
+        Reader::open(path).map_err(|error| AppError::Usage(format!("{}: {error}", path.display())))?;
+    let (writer, own) = (&reader.metadata().build, Build::own());
+    if !writer.is_as(&own) {
+        eprintln!("cz: {}: written by {writer}, this is {own}", path.display());
+    }
+    Ok(reader)
 }
 
 /// The numbers of processes of a recorded run.

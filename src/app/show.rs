@@ -152,7 +152,7 @@ fn all<S: Source>(reader: &Reader<S>, as_json: bool) -> (String, Vec<Damage>) {
             "controllers": metadata.controllers,
             "run_id": format!("{:016x}", metadata.run_id),
             "created": created,
-            "build": { "version": build.version, "target": build.target, "profile": build.profile },
+            "build": { "version": build.version, "commit": build.commit, "target": build.target, "profile": build.profile },
             "bytes": reader.length(),
             "dt_s": metadata.dt_ns as f64 * 1e-9,
             "steps": survey.steps,
@@ -169,10 +169,7 @@ fn all<S: Source>(reader: &Reader<S>, as_json: bool) -> (String, Vec<Damage>) {
     }
     let mut lines = vec![
         ("scenario", format!("{}, seed {}", metadata.scenario_name, metadata.seed)),
-        ("recorded", {
-            let build = &metadata.build;
-            format!("{created} by control-zones {} ({}, {})", build.version, build.target, build.profile)
-        }),
+        ("recorded", { format!("{created} by {}", metadata.build) }),
         (
             "processes",
             format!(

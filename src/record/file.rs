@@ -4,7 +4,7 @@
 
 use super::format::{FILE_MAGIC, Metadata, padded};
 use super::recorder::{Output, RecordError};
-use crate::encoding::MAX_BYTES;
+use crate::encoding::MAX_KEPT_BYTES;
 use rustix::fs::{FlockOperation, OFlags, flock};
 use rustix::io::Errno;
 use std::ffi::OsString;
@@ -35,8 +35,12 @@ pub(super) struct RecordingFile {
 pub(super) fn probe(path: &Path, metadata: &Metadata) -> Result<(), RecordError> {
     let failed = |source| RecordError::Create { path: path.to_owned(), source };
     let head = padded(metadata);
-    if head.len() > MAX_BYTES {
-        return Err(RecordError::TooLarge { path: path.to_owned(), found: head.len(), limit: MAX_BYTES });
+    if head.len() > MAX_KEPT_BYTES {
+        return Err(RecordError::TooLarge {
+            path: path.to_owned(),
+            found: head.len(),
+            limit: MAX_KEPT_BYTES,
+        });
     }
     if !is_replaceable(path).map_err(failed)? {
         return Err(RecordError::Occupied(path.to_owned()));

@@ -17,9 +17,9 @@ use zerocopy::{FromBytes, Immutable, IntoBytes};
 
 /// First bytes of a recording.
 pub const FILE_MAGIC: [u8; 8] = *b"CZLOG\r\n\x1a";
-/// The version of the format, which changes with what is encoded in the metadata and the footer too: 2 since
-/// scenarios have faults. Records have a version of their own, the schema hash.
-pub const FORMAT_VERSION: u32 = 2;
+/// The version of the format: 3 since metadata and footer name their fields. A new field there is no new version;
+/// records have a version of their own, the schema hash.
+pub const FORMAT_VERSION: u32 = 3;
 
 pub(super) const END_MAGIC: [u8; 8] = *b"CZend\0\0\x01";
 pub(super) const TAIL_MAGIC: [u8; 8] = *b"CZtail\0\x01";
@@ -156,7 +156,12 @@ impl Tail {
 /// What a recording is of: written at its beginning.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Metadata {
-    /// The scenario, as [`crate::scenario::encode`] gives it.
+    /// Who wrote the file.
+    pub build: Build,
+    /// The layouts of its records, as [`ipc_schemas::schema_text`] gives them.
+    pub schema: String,
+    /// The scenario, as [`crate::scenario::keep`] gives it.
+    #[serde(with = "serde_bytes")]
     pub scenario: Vec<u8>,
     /// Its hash.
     pub scenario_hash: u64,
@@ -176,8 +181,6 @@ pub struct Metadata {
     pub coordinators: u32,
     /// Number of controller processes, plug-ins included.
     pub controllers: u32,
-    /// Who wrote the file.
-    pub build: Build,
     /// When the run began, s since 1970.
     pub created_unix_s: u64,
 }
@@ -187,6 +190,8 @@ pub struct Metadata {
 pub struct Build {
     /// Version of the package.
     pub version: String,
+    /// Commit of the sources, with a `+` when they differed from it, or `unknown`.
+    pub commit: String,
     /// Processor architecture and operating system.
     pub target: String,
     /// `release` or `debug`.
@@ -198,10 +203,32 @@ impl Build {
     pub fn own() -> Build {
         Build {
             version: env!("CARGO_PKG_VERSION").to_owned(),
+            commit: env!("CZ_COMMIT").to_owned(),
             target: format!("{}-{}", std::env::consts::ARCH, std::env::consts::OS),
             profile: if cfg!(debug_assertions) { "debug" } else { "release" }.to_owned(),
         }
     }
+}
+
+impl Build {
+    /// Whether both may behave alike for all that is known: version and commit are the same.
+    pub fn is_as(&self, other: &Build) -> bool {
+        (&self.version, &self.commit) == (&other.version, &other.commit)
+    }
+}
+
+impl std::fmt::Display for Build {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Build { version, commit, target, profile } = self;
+        write!(f, "control-zones {version} (commit {commit}, {target}, {profile})")
+    }
+}
+
+/// What can be said of a file whose metadata cannot be read.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+pub(super) struct Origin {
+    pub build: Build,
+    pub schema: String,
 }
 
 impl Metadata {
@@ -209,7 +236,8 @@ impl Metadata {
     pub fn new(scenario: &Scenario, source: ScenarioSource, run_id: u64, processes: Processes) -> Metadata {
         let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
         Metadata {
-            scenario: crate::scenario::encode(scenario),
+            schema: ipc_schemas::schema_text(),
+            scenario: crate::scenario::keep(scenario),
             scenario_hash: scenario_hash(scenario),
             scenario_name: scenario.name.clone(),
             scenario_text: source.text,
@@ -285,7 +313,7 @@ impl std::fmt::Display for RunEnd {
 /// A value as bytes, filled up with zeros to a multiple of 8, behind the number of its own bytes.
 pub(super) fn padded(value: &impl Serialize) -> Vec<u8> {
     let mut bytes = vec![0; 8];
-    encoding::encode_onto(&mut bytes, value);
+    encoding::keep_onto(&mut bytes, value);
     let length = bytes.len() as u64 - 8;
     bytes[..8].copy_from_slice(&length.to_le_bytes());
     bytes.resize(bytes.len().next_multiple_of(8), 0);
@@ -296,5 +324,5 @@ pub(super) fn padded(value: &impl Serialize) -> Vec<u8> {
 pub(super) fn unpadded<T: serde::de::DeserializeOwned>(bytes: &[u8]) -> Result<T, encoding::DecodeError> {
     let (length, rest) = bytes.split_first_chunk::<8>().unwrap_or((&[0; 8], &[]));
     let own = usize::try_from(u64::from_le_bytes(*length)).ok().and_then(|n| rest.get(..n));
-    encoding::decode(own.unwrap_or_default())
+    encoding::kept(own.unwrap_or_default())
 }

@@ -19,7 +19,7 @@ pub use block::BlockFault;
 pub use compare::{Comparison, Difference, Section, compare};
 pub use file::is_growing;
 pub use format::{Build, Footer, Metadata, Processes, RunEnd, ScenarioSource};
-pub use reader::{Damage, FileSource, Flaw, OpenError, Reader, Source, Steps};
+pub use reader::{Builds, Damage, FileSource, Flaw, OpenError, Reader, Source, Steps};
 pub use recorder::{Output, QueueLimits, RecordError, Recorded, Recorder, steps_in};
 pub use replay::{Replay, ReplayError, RoleReport, Stop, replay, replay_world};
 #[cfg(fuzzing)]

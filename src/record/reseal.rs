@@ -5,7 +5,7 @@ use super::format::{
     Digest, END_MAGIC, EndHead, FILE_MAGIC, FORMAT_VERSION, FileHead, Metadata, Seal, Tail, digest, padded,
     unpadded,
 };
-use crate::scenario::{decode, scenario_hash};
+use crate::scenario::{kept, scenario_hash};
 use xxhash_rust::xxh3::xxh3_64;
 use zerocopy::{FromBytes, IntoBytes};
 
@@ -59,7 +59,7 @@ pub fn reseal(bytes: &[u8]) -> Vec<u8> {
 /// The metadata with what depends on the scenario set right, if it can be read.
 fn truthful(bytes: &[u8]) -> Vec<u8> {
     let Ok(mut metadata) = unpadded::<Metadata>(bytes) else { return bytes.to_vec() };
-    if let Ok(scenario) = decode(&metadata.scenario) {
+    if let Ok(scenario) = kept(&metadata.scenario) {
         metadata.scenario_hash = scenario_hash(&scenario);
         metadata.seed = scenario.seed;
         metadata.dt_ns = scenario.dt_ns;

@@ -19,7 +19,7 @@ pub mod share;
 pub use arrivals::ArrivalStream;
 pub use check::ScenarioFault;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
-pub use encode::{DecodeError, decode, encode, scenario_hash};
+pub use encode::{DecodeError, decode, encode, keep, kept, scenario_hash};
 pub use faults::{CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall};
 pub use load::{
     DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,

@@ -9,7 +9,7 @@ fn a_recording_of_another_version_is_refused_by_all_who_read_it() {
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("old.czlog");
     let name = file.to_str().unwrap();
-    for (found, version) in [(1_u32, "1"), (3, "3"), (u32::MAX, "4294967295")] {
+    for (found, version) in [(1_u32, "1"), (2, "2"), (4, "4"), (u32::MAX, "4294967295")] {
         let mut bytes = small().bytes;
         bytes[8..12].copy_from_slice(&found.to_le_bytes());
         std::fs::write(&file, &bytes).unwrap();
@@ -23,7 +23,7 @@ fn a_recording_of_another_version_is_refused_by_all_who_read_it() {
             let output = Site::new("old").command("cz").args(arguments).output().unwrap();
             let said = String::from_utf8(output.stderr).unwrap();
             let expected = format!(
-                "cz: {name}: the recording has format version {version}, this program reads version 2\n"
+                "cz: {name}: the recording has format version {version}, this program reads version 3\n"
             );
             assert_eq!((output.status.code(), said), (Some(2), expected), "{arguments:?}");
         }
@@ -125,4 +125,78 @@ fn the_commands_tell_what_is_in_a_file() {
         let (code, _, err) = cz(arguments);
         assert!(code == 2 && err.contains("99999"), "{err}");
     }
+}
+
+/// The recording with other metadata, sealed again.
+fn with_metadata(run: &Run, change: impl FnOnce(&mut Metadata)) -> Vec<u8> {
+    let mut metadata = run.metadata.clone();
+    change(&mut metadata);
+    Run::of(metadata, run.steps.clone(), run.state_hash).bytes
+}
+
+#[test]
+fn a_recording_of_another_build_is_read_and_named() {
+    let (site, directory) = (Site::new("build"), tempfile::tempdir().unwrap());
+    let file = directory.path().join("other.czlog");
+    let name = file.to_str().unwrap();
+    let other = with_metadata(&small(), |metadata| {
+        metadata.build.version = "0.0.9".to_owned();
+        metadata.build.commit = "0123456789ab".to_owned();
+    });
+    std::fs::write(&file, other).unwrap();
+    for arguments in [&["show", name][..], &["verify", name, name], &["replay", name]] {
+        let output = site.command("cz").args(arguments).output().unwrap();
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert!(output.status.success(), "{said}");
+        assert!(said.contains("written by control-zones 0.0.9 (commit 0123456789ab"), "{said}");
+        assert!(said.contains(&format!("this is control-zones {}", env!("CARGO_PKG_VERSION"))), "{said}");
+    }
+    std::fs::write(&file, small().bytes).unwrap();
+    let output = site.command("cz").args(["show", name]).output().unwrap();
+    assert!(output.stderr.is_empty(), "{output:?}");
+}
+
+#[test]
+fn a_recording_with_other_fields_is_refused_by_their_names() {
+    use ciborium::Value;
+    let run = small();
+    let text = |name: &str| Value::Text(name.to_owned());
+    /// The map that a field of the outermost map holds.
+    fn field<'a>(value: &'a mut Value, name: &str) -> &'a mut Vec<(Value, Value)> {
+        let fields = value.as_map_mut().unwrap();
+        let (_, inner) = fields.iter_mut().find(|(key, _)| key.as_text() == Some(name)).unwrap();
+        inner.as_map_mut().unwrap()
+    }
+    let scenario_with = |change: &dyn Fn(&mut Value)| {
+        with_metadata(&run, |metadata| {
+            let mut scenario: Value = ciborium::from_reader(&metadata.scenario[..]).unwrap();
+            change(&mut scenario);
+            metadata.scenario.clear();
+            ciborium::into_writer(&scenario, &mut metadata.scenario).unwrap();
+            // The hash is of what its writer knew.
+            metadata.scenario_hash ^= 1;
+        })
+    };
+    let refused = |bytes: &[u8]| Reader::new(bytes).unwrap_err().to_string();
+    let error = refused(&scenario_with(&|scenario| {
+        field(scenario, "vehicle").push((text("mass_kg"), Value::Float(1500.0)));
+    }));
+    assert!(error.contains("has vehicle.mass_kg, which this program does not know"), "{error}");
+    let error = refused(&scenario_with(&|scenario| {
+        field(scenario, "vehicle").retain(|(name, _)| name.as_text() != Some("v_max_mps"));
+    }));
+    assert!(error.contains("missing field `v_max_mps`") && error.contains("written by"), "{error}");
+
+    // Records of another layout, as a build would write them that has one.
+    let bytes = with_metadata(&run, |metadata| {
+        metadata.schema = metadata.schema.replacen("x_m", "s_m", 1);
+    });
+    let mut head = bytes[..48].to_vec();
+    head[16..24].copy_from_slice(&7_u64.to_le_bytes());
+    let length = u64::from_le_bytes(head[24..32].try_into().unwrap()) as usize;
+    let digest = xxhash_rust::xxh3::xxh3_128(&[&head[..32], &bytes[48..48 + length]].concat());
+    head[32..].copy_from_slice(&digest.to_le_bytes());
+    let error = refused(&[&head[..], &bytes[48..]].concat());
+    assert!(error.contains("the file has `") && error.contains(" s_m`"), "{error}");
+    assert!(error.contains("this program has `") && error.contains(" x_m`"), "{error}");
 }

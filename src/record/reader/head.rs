@@ -1,9 +1,10 @@
 //! The head of a recording: without it no step means anything, so it is sound or nothing is read.
 
-use super::super::format::{Digest, FILE_MAGIC, FORMAT_VERSION, FileHead, Metadata, unpadded};
+use super::super::format::{Build, Digest, FILE_MAGIC, FORMAT_VERSION, FileHead, Metadata, Origin, unpadded};
 use super::source::{Source, bytes, fixed};
+use crate::encoding::first_unknown_field;
 use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
-use crate::scenario::{DecodeError, Scenario, ScenarioFault, decode, scenario_hash};
+use crate::scenario::{DecodeError, Scenario, ScenarioFault, keep, kept, scenario_hash};
 use std::io;
 use std::sync::Arc;
 
@@ -26,25 +27,62 @@ pub enum OpenError {
     #[error("the head of the file is {0}")]
     Head(&'static str),
     /// The records have another layout.
-    #[error("its records have schema {found:016x}, this program's have {expected:016x}")]
+    #[error(
+        "its records are others than this program's (schema {found:016x}, expected {expected:016x}): {differences}; {builds}"
+    )]
     OtherSchema {
         /// Ours.
         expected: u64,
         /// The file's.
         found: u64,
+        /// Where they differ.
+        differences: String,
+        /// Who wrote it, and who reads it.
+        builds: Builds,
     },
     /// The metadata cannot be decoded.
-    #[error("the metadata cannot be read: {0}")]
-    Metadata(DecodeError),
+    #[error("the metadata cannot be read: {error}; {builds}")]
+    Metadata {
+        /// Why.
+        error: DecodeError,
+        /// Who wrote it, and who reads it.
+        builds: Builds,
+    },
     /// The scenario cannot be decoded.
-    #[error("the scenario in it cannot be read: {0}")]
-    Scenario(DecodeError),
+    #[error("the scenario in it cannot be read: {error}; {builds}")]
+    Scenario {
+        /// Why.
+        error: DecodeError,
+        /// Who wrote it, and who reads it.
+        builds: Builds,
+    },
+    /// The scenario has a setting that this program does not have.
+    #[error("the scenario in it has {field}, which this program does not know; {builds}")]
+    UnknownField {
+        /// Its name.
+        field: String,
+        /// Who wrote it, and who reads it.
+        builds: Builds,
+    },
     /// The scenario is none that the loader would have let pass.
     #[error("the scenario in it is not valid: {0}")]
     BadScenario(#[from] ScenarioFault),
     /// The metadata contradicts the scenario.
     #[error("the metadata contradicts itself: {0}")]
     Contradiction(&'static str),
+}
+
+/// Who wrote a recording, if that can be read, and who reads it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Builds(Option<Box<Build>>);
+
+impl std::fmt::Display for Builds {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match &self.0 {
+            Some(writer) => write!(f, "written by {writer}, this is {}", Build::own()),
+            None => write!(f, "it does not say by whom it was written, this is {}", Build::own()),
+        }
+    }
 }
 
 /// What a sound head says.
@@ -76,20 +114,62 @@ impl Head {
         if head.digest != head.digest_with(&bytes) {
             return Err(OpenError::Head("damaged"));
         }
+        let origin = unpadded::<Origin>(&bytes).ok();
+        let builds = Builds(origin.as_ref().map(|origin| Box::new(origin.build.clone())));
         let expected = ipc_schemas::schema_hash();
         if head.schema_hash != expected {
-            return Err(OpenError::OtherSchema { expected, found: head.schema_hash });
+            let theirs = origin.map(|origin| origin.schema).unwrap_or_default();
+            let differences = differences(&theirs, &ipc_schemas::schema_text());
+            return Err(OpenError::OtherSchema { expected, found: head.schema_hash, differences, builds });
         }
-        let metadata: Metadata = unpadded(&bytes).map_err(OpenError::Metadata)?;
-        let scenario = Arc::new(sound_scenario(&metadata)?);
+        let metadata: Metadata = match unpadded(&bytes) {
+            Ok(metadata) => metadata,
+            Err(error) => return Err(OpenError::Metadata { error, builds }),
+        };
+        let scenario = Arc::new(sound_scenario(&metadata, builds)?);
         Ok(Head { metadata, scenario, first: begin + head.metadata, first_link: head.digest })
     }
 }
 
-fn sound_scenario(metadata: &Metadata) -> Result<Scenario, OpenError> {
-    let scenario = decode(&metadata.scenario).map_err(OpenError::Scenario)?;
+/// What differs between the records of a file and ours, the first few fields.
+fn differences(theirs: &str, ours: &str) -> String {
+    const SHOWN: usize = 5;
+    // Fields are indented below the name and size of their record.
+    fn fields(text: &str) -> Vec<(&str, &str)> {
+        let mut record = "";
+        let line = |line: &'_ str| line.starts_with(' ');
+        text.lines()
+            .map(|text| {
+                if !line(text) {
+                    record = text.split(' ').next().unwrap_or_default();
+                }
+                (record, text.trim())
+            })
+            .collect()
+    }
+    let (theirs, ours) = (fields(theirs), fields(ours));
+    let only = |here: &[(&str, &str)], there: &[(&str, &str)], whose: &str| -> Vec<String> {
+        let line = |(record, text): &(&str, &str)| format!("{record}: {whose} has `{text}`");
+        here.iter().filter(|entry| !there.contains(entry)).map(line).collect()
+    };
+    let mut all = only(&theirs, &ours, "the file");
+    all.truncate(SHOWN);
+    let mut own = only(&ours, &theirs, "this program");
+    own.truncate(SHOWN);
+    all.append(&mut own);
+    if all.is_empty() { "which fields it does not say".to_owned() } else { all.join(", ") }
+}
+
+fn sound_scenario(metadata: &Metadata, builds: Builds) -> Result<Scenario, OpenError> {
+    let scenario = match kept(&metadata.scenario) {
+        Ok(scenario) => scenario,
+        Err(error) => return Err(OpenError::Scenario { error, builds }),
+    };
     scenario.check()?;
     if scenario_hash(&scenario) != metadata.scenario_hash {
+        if let Some(field) = first_unknown_field(&metadata.scenario, &keep(&scenario)) {
+            return Err(OpenError::UnknownField { field, builds });
+        }
         return Err(OpenError::Contradiction("another scenario hash than the scenario's"));
     }
     if scenario.dt_ns != metadata.dt_ns || scenario.seed != metadata.seed {

@@ -12,7 +12,7 @@ mod source;
 mod steps;
 
 pub use damage::{Damage, Flaw};
-pub use head::OpenError;
+pub use head::{Builds, OpenError};
 pub use source::{FileSource, Source};
 pub use steps::Steps;
 
