@@ -3,6 +3,7 @@
 
 pub mod app;
 pub mod bench;
+pub mod conflict;
 pub mod control;
 pub mod coordination;
 pub mod encoding;

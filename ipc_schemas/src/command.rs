@@ -28,45 +28,74 @@ codes! {
     pub const VERDICT_FALLBACK: u16 = 5;
 }
 
+/// Number of words a controller may remember of each vehicle.
+pub const MEMORY_WORDS: usize = 8;
+
 record! {
     /// One vehicle's command for the step, and what its controller must remember.
     ///
-    /// Commands come in the order of the state frame. The `plan_*` fields and `mode` are the
-    /// controller's memory: with them a frame holds all that a controller needs to go on from it. A
-    /// controller of another kind may use them freely.
-    #[type_name("cz.VehicleCommand.v1")]
+    /// Commands come in the order of the state frame. `mode` and the memory words are the controller's own: they
+    /// mean what its law says, and with them a frame holds all that a controller needs to go on from it.
+    #[type_name("cz.VehicleCommand.v2")]
     pub struct VehicleCommand {
         /// Acceleration over `[k * dt, (k + 1) * dt)`, m/s^2.
         pub u_mps2: f64,
-        /// Broadcast intent: planned instant at the conflict point, s (0 when there is no plan).
+        /// Broadcast intent: planned instant at the end of the path, s (0 when there is no plan).
         pub planned_exit_time_s: f64,
         /// Broadcast intent: planned speed there, m/s.
         pub planned_exit_speed_mps: f64,
-        /// Memory: instant at which the plan starts, s.
-        pub plan_start_s: f64,
-        /// Memory: position at that instant, m.
-        pub plan_origin_m: f64,
-        /// Memory: speed at that instant, m/s (coefficient c).
-        pub plan_v0_mps: f64,
-        /// Memory: coefficient a of u*(t) = a t + b, m/s^3.
-        pub plan_a: f64,
-        /// Memory: coefficient b, m/s^2.
-        pub plan_b: f64,
-        /// Memory: duration T of the plan, s (0 when there is no plan).
-        pub plan_duration_s: f64,
-        /// Memory: terminal speed the plan was made for, m/s (-1 when it was free).
-        pub plan_terminal_mps: f64,
+        /// Memory.
+        pub memory_0: f64,
+        /// Memory.
+        pub memory_1: f64,
+        /// Memory.
+        pub memory_2: f64,
+        /// Memory.
+        pub memory_3: f64,
+        /// Memory.
+        pub memory_4: f64,
+        /// Memory.
+        pub memory_5: f64,
+        /// Memory.
+        pub memory_6: f64,
+        /// Memory.
+        pub memory_7: f64,
         /// The vehicle.
         pub vehicle: u32,
         /// Its zone.
         pub zone: u32,
         /// Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4 rear end,
-        /// 5 rear-end feasibility, 6 merge, 7 merge feasibility.
+        /// 5 rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross feasibility.
         pub binding_rows: u32,
-        /// Memory: 0 entered, 1 FE, 2 OCBF.
+        /// Memory: 0 entered, 1 FE, 2 OCBF; other laws may have other modes.
         pub mode: u16,
         /// 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a deadline was
         /// missed, and refused from a controller: 4 held, 5 held within what the shield allows.
         pub verdict: u16,
+    }
+}
+
+impl VehicleCommand {
+    /// The memory words.
+    pub fn memory(&self) -> [f64; MEMORY_WORDS] {
+        let Self { memory_0, memory_1, memory_2, memory_3, memory_4, memory_5, memory_6, memory_7, .. } =
+            *self;
+        [memory_0, memory_1, memory_2, memory_3, memory_4, memory_5, memory_6, memory_7]
+    }
+
+    /// The same command with these memory words.
+    pub fn remembering(self, memory: [f64; MEMORY_WORDS]) -> VehicleCommand {
+        let [memory_0, memory_1, memory_2, memory_3, memory_4, memory_5, memory_6, memory_7] = memory;
+        VehicleCommand {
+            memory_0,
+            memory_1,
+            memory_2,
+            memory_3,
+            memory_4,
+            memory_5,
+            memory_6,
+            memory_7,
+            ..self
+        }
     }
 }

@@ -8,10 +8,15 @@ use crate::record;
 codes! {
     /// [`Assignment::kind`]: no partner; the record only carries the terminal speed.
     pub const CONSTRAINT_NONE: u16 = 0;
-    /// [`Assignment::kind`]: the partner drives ahead on the same path (paper: i_p).
+    /// [`Assignment::kind`]: the partner drives ahead on the way the two share (paper: i_p).
     pub const CONSTRAINT_REAR_END: u16 = 1;
-    /// [`Assignment::kind`]: the partner passes the shared conflict point first (paper: i-1).
+    /// [`Assignment::kind`]: the partner passes the merge first (paper: i-1). Behind it, it is the leader.
     pub const CONSTRAINT_MERGE: u16 = 2;
+    /// [`Assignment::kind`]: the partner crosses first. Nothing is owed once the vehicle has reached the crossing.
+    pub const CONSTRAINT_CROSS: u16 = 3;
+
+    /// [`Assignment::point`]: none; toward a leader.
+    pub const NO_POINT: u32 = u32::MAX;
 
     /// [`Assignment::flags`]: the terminal speed is free; `terminal_speed_mps` is 0 and means nothing.
     pub const ASSIGNMENT_FREE_TERMINAL: u16 = 1;
@@ -21,14 +26,22 @@ record! {
     /// One constraint of one vehicle, as the zone's coordinator decided it.
     ///
     /// A coordinator sends the whole list of each zone that acts in this step; it replaces what the
-    /// zone had before. Each member has at least one record; a path with several conflict points
-    /// has one per point.
-    #[type_name("cz.Assignment.v1")]
+    /// zone had before. Each member has at least one record, and one per conflict point at which somebody passes
+    /// before it; members come in the order of the state frame. Between events the positions of the two decide what is
+    /// in force: nothing once the partner is at `until_m`; toward a merging partner what is owed to a leader once the
+    /// vehicle has passed the point; toward a crossing one nothing from then on.
+    #[type_name("cz.Assignment.v2")]
     pub struct Assignment {
-        /// Distance of the conflict point from the zone's origin on the vehicle's path, m.
+        /// Distance of the conflict point from the zone's origin on the vehicle's path, m. Toward a leader, of a
+        /// place that both pass: what counts is the difference to the next field.
         pub own_conflict_m: f64,
         /// The same point's distance from the origin on the partner's path, m.
         pub partner_conflict_m: f64,
+        /// Distance delta to be kept to the partner beside phi v, m.
+        pub gap_m: f64,
+        /// Position of the partner on its own path from which on nothing is owed to it, m; infinite while the two
+        /// drive on together.
+        pub until_m: f64,
         /// Terminal speed v_m the vehicle is to leave the zone with, m/s.
         pub terminal_speed_mps: f64,
         /// The vehicle bound by this record.
@@ -37,7 +50,11 @@ record! {
         pub partner: u32,
         /// Zone index.
         pub zone: u32,
-        /// 0 none, 1 rear end, 2 merge.
+        /// Index of the conflict point within the zone, or `NO_POINT`.
+        pub point: u32,
+        /// Place of the vehicle in the zone's passing order, from 0.
+        pub rank: u32,
+        /// 0 none, 1 rear end, 2 merge, 3 cross.
         pub kind: u16,
         /// Bit 0: the terminal speed is free.
         pub flags: u16,

@@ -46,7 +46,8 @@ pub const LAYOUTS: [Layout; 10] = [
     AttachRequest::LAYOUT,
     AttachReply::LAYOUT,
     RunSpec::LAYOUT,
-    ApproachSpec::LAYOUT,
+    PathSpec::LAYOUT,
+    KindSpec::LAYOUT,
 ];
 
 /// All public codes, flags and service names, one table per module that declares some.

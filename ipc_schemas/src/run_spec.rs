@@ -6,8 +6,8 @@ use crate::code::codes;
 use crate::record;
 
 codes! {
-    /// [`ApproachSpec::flags`]: the controller that asked drives this approach.
-    pub const APPROACH_OWN: u32 = 1;
+    /// [`PathSpec::flags`]: the controller that asked drives this path.
+    pub const PATH_OWN: u32 = 1;
 
     /// [`RunSpec::law_flags`]: the reference trajectory follows the condition as the paper prints it.
     pub const LAW_AS_PRINTED: u32 = 1;
@@ -37,9 +37,9 @@ codes! {
 record! {
     /// The numbers of a run: step, limits, distances, and the built-in law's gains.
     ///
-    /// The reply to a plug-in that joins carries one, then `approaches` records of `ApproachSpec`, then
-    /// for each of these a line of UTF-8 text, `ZONE.APPROACH`.
-    #[type_name("cz.RunSpec.v1")]
+    /// The reply to a plug-in that joins carries one, then `paths` records of `PathSpec`, then `kinds` records of
+    /// `KindSpec`, then for each path a line of UTF-8 text, `ZONE.PATH`.
+    #[type_name("cz.RunSpec.v2")]
     pub struct RunSpec {
         /// Step length, s.
         pub dt_s: f64,
@@ -71,7 +71,7 @@ record! {
         pub clf_rate_per_s: f64,
         /// Weight lambda of the squared slack.
         pub slack_weight: f64,
-        /// Fraction of the approach within which FE mode may act.
+        /// Fraction of the path within which FE mode may act.
         pub fe_fraction: f64,
         /// Step length, ns. Simulated time is `step * dt_ns`.
         pub dt_ns: u64,
@@ -79,8 +79,12 @@ record! {
         pub seed: u64,
         /// Number of zones.
         pub zones: u32,
-        /// Number of approaches, of all zones.
-        pub approaches: u32,
+        /// Number of paths, of all zones.
+        pub paths: u32,
+        /// Number of kinds of vehicles.
+        pub kinds: u32,
+        /// 0; room for what comes later.
+        pub reserved: u32,
         /// Switches of the built-in law, one bit each.
         pub law_flags: u32,
         /// 0 off, 1 observe, 2 on.
@@ -89,25 +93,46 @@ record! {
 }
 
 record! {
-    /// One approach of one zone; zones ascending, then paths.
-    #[type_name("cz.ApproachSpec.v1")]
-    pub struct ApproachSpec {
-        /// Distance from the zone's origin to the conflict point, m.
+    /// One path of one zone; zones ascending, then paths.
+    #[type_name("cz.PathSpec.v2")]
+    pub struct PathSpec {
+        /// Length from the zone's origin to its exit, m.
         pub length_m: f64,
-        /// Length of the link behind the zone's exit, m (0: none).
+        /// Length of the link behind the exit, m (0: none).
         pub link_m: f64,
         /// Zone index.
         pub zone: u32,
         /// Index of the path within the zone.
         pub path: u32,
-        /// Zone the exit leads to, or `NO_ZONE`.
+        /// Index of the exit it leads to within the zone.
+        pub exit: u32,
+        /// Zone the exit leads to, or `NO_ZONE`. Which path a vehicle takes there is in its `VehicleState`.
         pub next_zone: u32,
-        /// Path within that zone.
-        pub next_path: u32,
-        /// Index of the controller process that drives the approach.
+        /// Index of the controller process that drives the path.
         pub controller: u32,
         /// Bit 0: the controller that asked drives it.
         pub flags: u32,
+    }
+}
+
+record! {
+    /// One kind of vehicle, in the order of `VehicleState::kind`.
+    #[type_name("cz.KindSpec.v1")]
+    pub struct KindSpec {
+        /// Strongest braking, m/s^2, negative.
+        pub u_min_mps2: f64,
+        /// Strongest acceleration, m/s^2.
+        pub u_max_mps2: f64,
+        /// Least speed, m/s.
+        pub v_min_mps: f64,
+        /// Greatest speed, m/s.
+        pub v_max_mps: f64,
+        /// Length, m.
+        pub length_m: f64,
+        /// Reaction time phi, s.
+        pub reaction_time_s: f64,
+        /// Standstill gap delta, m.
+        pub standstill_gap_m: f64,
     }
 }
 

@@ -7,7 +7,7 @@ use crate::scenario::Scenario;
 /// The scenario arguments with `--controller`s turned into `--set`s, and the scenario they give.
 ///
 /// A target is the name of a controller the scenario declares, whose command it becomes, or a list of
-/// zones and approaches (`merge-1,merge-2.main`) for which a controller is declared.
+/// zones and paths (`merge-1,merge-2.main`) for which a controller is declared.
 pub(super) fn load(
     scenario: &ScenarioArgs,
     controllers: &[String],
@@ -36,7 +36,7 @@ pub(super) fn load(
                 "--controller {text}: the scenario declares its controllers; expected one of {names}"
             )));
         }
-        let (approaches, zones): (Vec<_>, Vec<_>) = target.split(',').partition(|t| t.contains('.'));
+        let (paths, zones): (Vec<_>, Vec<_>) = target.split(',').partition(|t| t.contains('.'));
         let list = |key: &str, items: &[&str]| match items {
             [] => String::new(),
             _ => format!("{key} = [{}], ", items.iter().map(|i| quote(i)).collect::<Vec<_>>().join(", ")),
@@ -45,7 +45,7 @@ pub(super) fn load(
             "{{name = {}, {}{}command = {}}}",
             quote(&target.replace('.', "-").replace(',', "_")),
             list("zones", &zones),
-            list("approaches", &approaches),
+            list("paths", &paths),
             quote(command)
         ));
     }

@@ -1,8 +1,9 @@
 //! Test vectors of the paper's law, for authors who check their numbers.
 
+use crate::conflict::DutyKind;
 use crate::control::Terminal;
-use crate::control::law::{Law, Memory, Mode, Partner, PartnerKind, Situation};
 use crate::control::reference::Problem;
+use crate::control::{Law, Memory, Mode, Ocbf, Partner, Situation};
 use crate::scenario::{ReferenceLaw, load};
 use serde_json::{Value, json};
 
@@ -36,10 +37,10 @@ fn plans() -> Vec<Value> {
 
 fn decisions() -> Vec<Value> {
     let scenario = load(None, &[], None).expect("the embedded scenario is valid");
-    let law = Law::new(&scenario);
+    let law = Ocbf::new(&scenario);
     let mut vectors = Vec::new();
     for (x_m, v_mps) in [(10.0, 16.0), (60.0, 18.0), (120.0, 15.0), (180.0, 19.0)] {
-        for partner in [None, Some((PartnerKind::RearEnd, 32.0)), Some((PartnerKind::Merge, 26.0))] {
+        for partner in [None, Some((DutyKind::RearEnd, 32.0)), Some((DutyKind::Merge, 26.0))] {
             let s = Situation {
                 time_s: 10.0,
                 x_m,
@@ -48,6 +49,7 @@ fn decisions() -> Vec<Value> {
                 entry_speed_mps: 16.0,
                 length_m: 200.0,
                 terminal: Terminal::Speed(18.5),
+                kind: 0,
             };
             let partner = partner.map(|(kind, gap)| Partner {
                 kind,
@@ -55,6 +57,7 @@ fn decisions() -> Vec<Value> {
                 v_mps: 15.5,
                 u_mps2: -0.5,
                 conflict_m: 200.0,
+                gap_m: scenario.vehicle.standstill_gap_m,
             });
             let mut memory = Memory { mode: Mode::Ocbf, plan: None };
             let decision = law.decide(&s, partner.into_iter(), &mut memory);
@@ -62,7 +65,7 @@ fn decisions() -> Vec<Value> {
                 "time": s.time_s, "x": x_m, "v": v_mps, "entry_time": s.entry_time_s,
                 "entry_speed": s.entry_speed_mps, "length": s.length_m, "terminal": 18.5,
                 "partner": partner.map(|p| json!({
-                    "kind": if p.kind == PartnerKind::RearEnd { "rear_end" } else { "merge" },
+                    "kind": if p.kind == DutyKind::RearEnd { "rear_end" } else { "merge" },
                     "x": p.x_m, "v": p.v_mps, "u": p.u_mps2,
                 })),
                 "u": decision.u_mps2,

@@ -5,6 +5,7 @@ mod bench;
 mod bench_wait;
 mod clean;
 mod controllers;
+mod draw;
 mod golden;
 mod lines;
 mod parts;

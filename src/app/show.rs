@@ -12,6 +12,13 @@ use serde_json::{Value, json};
 use std::path::Path;
 
 pub(super) fn show(args: &ShowArgs) -> Result<(), AppError> {
+    if args.network {
+        let name = args.file.to_string_lossy();
+        let scenario = crate::scenario::load(Some(&name), &[], None)?;
+        let out = args.out.clone().unwrap_or_else(|| format!("{}.svg", scenario.name).into());
+        super::draw::network(&scenario, &out)?;
+        return print(&format!("{}\n", out.display()));
+    }
     let reader = open(&args.file)?;
     let path = args.file.display();
     let (text, damage) = match (args.step, args.vehicle) {
@@ -440,7 +447,7 @@ fn place(scenario: &Scenario, state: &VehicleState) -> String {
         return "link".to_owned();
     }
     let zone = scenario.network.zones.get(state.zone as usize);
-    let path = zone.and_then(|zone| zone.approaches.get(state.path as usize));
+    let path = zone.and_then(|zone| zone.paths.get(state.path as usize));
     match path {
         Some(path) => format!("{}.{}", zone_name(scenario, state.zone), path.name),
         None => format!("{}, path {}", zone_name(scenario, state.zone), state.path),

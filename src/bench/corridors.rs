@@ -1,6 +1,6 @@
 //! A scenario as large as wanted: many two-zone merging corridors side by side.
 
-use crate::scenario::{Approach, Demand, Exit, Poisson, RatePeriod, Road, Source, SpeedDistribution, Zone};
+use crate::scenario::{Demand, Poisson, RatePeriod, Road, Source, SpeedDistribution, Zone};
 use crate::scenario::{Override, Scenario, ScenarioError, load_embedded};
 
 /// Mean number of vehicles at once in one corridor under the demand below, once it has filled up; measured.
@@ -19,34 +19,25 @@ pub fn corridors(vehicles: usize, until_s: f64) -> Result<Scenario, ScenarioErro
     let roads_per = roads.len() as u32;
     for i in 0..count {
         for zone in &zones {
-            scenario.network.zones.push(Zone {
-                name: format!("{}-{i}", zone.name),
-                approaches: zone
-                    .approaches
-                    .iter()
-                    .map(|a| Approach {
-                        name: a.name.clone(),
-                        length_m: 400.0,
-                        source: match a.source {
-                            Source::Road(r) => Source::Road(r + i * roads_per),
-                            Source::Zone(z) => Source::Zone(z + i * zones_per),
-                        },
-                    })
-                    .collect(),
-                exit: match zone.exit {
-                    Exit::Out => Exit::Out,
-                    Exit::Zone { zone, path, link_m, link_speed_mps } => {
-                        Exit::Zone { zone: zone + i * zones_per, path, link_m, link_speed_mps }
-                    }
-                },
-                flow: zone.flow.clone(),
-            });
+            let mut zone = Zone { name: format!("{}-{i}", zone.name), ..zone.clone() };
+            for segment in &mut zone.segments {
+                segment.length_m = 400.0;
+                match segment.source.as_mut() {
+                    Some(Source::Road(road)) => *road += i * roads_per,
+                    Some(Source::Zone { zone, .. }) => *zone += i * zones_per,
+                    None => {}
+                }
+            }
+            zone.paths.iter_mut().for_each(|path| path.length_m = 400.0);
+            zone.exits.iter_mut().filter_map(|exit| exit.to.as_mut()).for_each(|to| to.zone += i * zones_per);
+            scenario.network.zones.push(zone);
         }
         for road in &roads {
             scenario.network.roads.push(Road {
                 name: format!("{}-{i}", road.name),
                 zone: road.zone + i * zones_per,
-                path: road.path,
+                segment: road.segment,
+                routes: Vec::new(),
                 demand: Demand::Poisson(Poisson {
                     rates: vec![RatePeriod { until_s, vehicles_per_hour: 400.0 }],
                     min_headway_s: 2.0,

@@ -3,7 +3,7 @@
 use super::instructions::Instructions;
 use super::machine::Machine;
 use super::{BenchError, io};
-use crate::control::law::Program;
+use crate::control::ocbf::Program;
 use crate::control::rows::Row;
 use crate::control::{ControllerPool, clarabel, qp};
 use crate::coordination::Coordinator;

@@ -4,11 +4,13 @@
 
 pub mod clarabel;
 pub mod law;
+pub mod ocbf;
 pub mod pool;
 pub mod qp;
 pub mod reference;
 pub mod rows;
 
-pub use law::{Decision, Law, Memory, Mode, Partner, PartnerKind, Situation, Verdict};
+pub use law::{Decision, Law, Laws, Partner, Situation, Verdict, Words};
+pub use ocbf::{Memory, Mode, Ocbf};
 pub use pool::ControllerPool;
 pub use reference::{Optimum, Reference, Terminal};

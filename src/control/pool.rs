@@ -1,8 +1,10 @@
 //! The controller role: the vehicles of some zones, from state and coordination frames to commands.
 
-use super::law::{Law, Memory, Mode, Partner, PartnerKind, Program, Situation, Verdict};
-use super::reference::{Optimum, Reference, Terminal};
+use super::law::{Decision, Law, Laws, Partner, Situation, Verdict, Words};
+use super::ocbf::Program;
+use super::reference::Terminal;
 use super::rows::Row;
+use crate::conflict::{Duty, DutyKind};
 use crate::lanes::{AHEAD, Lanes, fetch};
 use crate::scenario::{Scenario, ZoneId};
 use crate::vehicle::Inequality;
@@ -10,38 +12,41 @@ use ipc_schemas::{self as frames, Assignment, VehicleCommand, VehicleState};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Drives the vehicles of a contiguous range of zones with the built-in law.
+/// Drives the vehicles of a contiguous range of zones with the laws of these.
 #[derive(Debug)]
 pub struct ControllerPool {
-    law: Law,
+    laws: Vec<Laws>,
+    /// By zone, index of its law.
+    law_of: Vec<u8>,
     v_max_mps: f64,
+    kinds: u16,
     zones: Range<ZoneId>,
-    /// Lengths of each zone's approaches, m.
+    /// Lengths of each zone's paths, m.
     lengths_m: Lanes<f64>,
     /// The vehicles of each zone, aligned with its members in the state frame.
     members: Lanes<Member>,
     /// Their constraints.
-    constraints: Lanes<Constraint>,
+    constraints: Lanes<Duty>,
     /// Where each zone's slice began in the last frame: about where it begins in the next.
     starts: Vec<usize>,
     /// A zone's new members and constraints while they are put together; kept for their allocations.
-    crew: Crew,
-    /// Approaches of these zones that plug-ins drive.
+    renewed: Renewed,
+    /// Paths of these zones that plug-ins drive.
     plugged: Vec<(ZoneId, u32)>,
 }
 
 /// The vehicles of one zone and what binds them.
 #[derive(Debug, Default)]
-struct Crew {
+struct Renewed {
     members: Vec<Member>,
-    constraints: Vec<Constraint>,
+    constraints: Vec<Duty>,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Member {
     vehicle: u32,
     terminal: Terminal,
-    memory: Memory,
+    memory: Words,
     /// Range in the zone's constraints.
     first_constraint: u32,
     end_constraint: u32,
@@ -50,22 +55,13 @@ struct Member {
 /// About as many records as [`AHEAD`] zones have.
 const RECORDS_AHEAD: usize = 24;
 
-/// An assignment, resolved to a place in the zone's slice of the state frame. The slice keeps its
+/// The partners of one vehicle, looked up in its zone's slice of the state frame. The slice keeps its
 /// shape until the zone's next event, and with that event come new assignments.
-#[derive(Clone, Copy, Debug)]
-struct Constraint {
-    kind: PartnerKind,
-    partner_at: u32,
-    /// Added to the partner's position to express it in the vehicle's coordinate, m.
-    shift_m: f64,
-    conflict_m: f64,
-}
-
-/// The partners of one vehicle, looked up in its zone's slice of the state frame.
 #[derive(Clone, Debug)]
 struct Partners<'a> {
-    constraints: std::slice::Iter<'a, Constraint>,
+    constraints: std::slice::Iter<'a, Duty>,
     slice: &'a [VehicleState],
+    x_m: f64,
 }
 
 impl Iterator for Partners<'_> {
@@ -73,15 +69,19 @@ impl Iterator for Partners<'_> {
 
     #[inline]
     fn next(&mut self) -> Option<Partner> {
-        let c = self.constraints.next()?;
-        let partner = &self.slice[c.partner_at as usize];
-        Some(Partner {
-            kind: c.kind,
-            x_m: partner.x_m + c.shift_m,
-            v_mps: partner.v_mps,
-            u_mps2: partner.u_mps2,
-            conflict_m: c.conflict_m,
-        })
+        loop {
+            let duty = self.constraints.next()?;
+            let partner = &self.slice[duty.partner as usize];
+            let Some(kind) = duty.in_force(self.x_m, partner.x_m) else { continue };
+            return Some(Partner {
+                kind,
+                x_m: partner.x_m + duty.shift_m(),
+                v_mps: partner.v_mps,
+                u_mps2: partner.u_mps2,
+                conflict_m: duty.own_m,
+                gap_m: duty.gap_m,
+            });
+        }
     }
 }
 
@@ -123,18 +123,30 @@ impl ControllerPool {
         let count = zones.len();
         let mut lengths_m = Lanes::new(count);
         for (lane, zone) in zones.clone().enumerate() {
-            let approaches = &scenario.network.zones[zone as usize].approaches;
-            approaches.iter().for_each(|a| lengths_m.push(lane, a.length_m));
+            let paths = &scenario.network.zones[zone as usize].paths;
+            paths.iter().for_each(|path| lengths_m.push(lane, path.length_m));
         }
-        let plugged = scenario.plugins.iter().flat_map(|p| p.approaches.iter().copied());
+        let plugged = scenario.plugins.iter().flat_map(|p| p.paths.iter().copied());
+        let mut kinds: Vec<crate::scenario::LawKind> = Vec::new();
+        let law_of = zones.clone().map(|zone| {
+            let kind = scenario.network.zones[zone as usize].law;
+            let at = kinds.iter().position(|known| *known == kind).unwrap_or_else(|| {
+                kinds.push(kind);
+                kinds.len() - 1
+            });
+            at as u8
+        });
+        let law_of = law_of.collect();
         ControllerPool {
-            law: Law::new(&scenario),
+            laws: kinds.iter().map(|kind| Laws::of(&scenario, *kind)).collect(),
+            law_of,
+            kinds: scenario.fleet.len() as u16,
             v_max_mps: scenario.vehicle.v_max_mps,
             lengths_m,
             members: Lanes::new(count),
             constraints: Lanes::new(count),
             starts: vec![0; count],
-            crew: Crew::default(),
+            renewed: Renewed::default(),
             plugged: plugged.filter(|(zone, _)| zones.contains(zone)).collect(),
             zones,
         }
@@ -142,8 +154,7 @@ impl ControllerPool {
 
     /// The number of commands a state frame asks of this pool.
     pub fn command_count(&self, states: &[VehicleState]) -> usize {
-        let own = self.own(states).iter().filter(|s| s.flags & frames::STATE_LEFT == 0);
-        own.filter(|s| !self.is_plugged(s)).count()
+        self.own(states).iter().filter(|s| s.is_commanded() && !self.is_plugged(s)).count()
     }
 
     /// Takes a coordination frame; assignments of other pools' zones are skipped.
@@ -163,9 +174,9 @@ impl ControllerPool {
                 drift = from.wrapping_sub(self.starts[lane]);
                 let slice = states[from..].chunk_by(|a, b| a.zone == b.zone).next().unwrap_or(&[]);
                 let slice = if slice.first().is_some_and(|s| s.zone == zone) { slice } else { &[] };
-                self.crew.assign(zone, slice, group, &self.members[lane], self.v_max_mps)?;
-                self.members.set(lane, &self.crew.members);
-                self.constraints.set(lane, &self.crew.constraints);
+                self.renewed.assign(zone, slice, group, &self.members[lane], self.v_max_mps)?;
+                self.members.set(lane, &self.renewed.members);
+                self.constraints.set(lane, &self.renewed.constraints);
             }
         }
         Ok(())
@@ -196,7 +207,7 @@ impl ControllerPool {
         for group in in_force.chunk_by(|a, b| a.zone == b.zone) {
             let from = states.partition_point(|s| s.zone < group[0].zone);
             let slice = states[from..].iter().take_while(|s| s.zone == group[0].zone);
-            let members = slice.filter(|s| s.flags & frames::STATE_LEFT == 0).map(|s| s.vehicle);
+            let members = slice.filter(|state| !state.has_left()).map(|state| state.vehicle);
             if members.eq(group.chunk_by(|a, b| a.vehicle == b.vehicle).map(|g| g[0].vehicle)) {
                 self.coordinate(states, group)?;
             }
@@ -211,33 +222,35 @@ impl ControllerPool {
         states: &[VehicleState],
         mut emit: impl FnMut(VehicleCommand),
     ) -> Result<(), PoolError> {
-        self.visit(time_s, states, |law, state, situation, partners, memory| {
-            let decision = law.decide(situation, partners, memory);
-            emit(command(state, &decision, memory));
+        self.visit(time_s, states, |laws, scene| match laws {
+            Laws::Ocbf(law) => scene.decide(law, &mut emit),
         })
     }
 
-    /// Shows every program the law would solve in this step, and changes nothing.
+    /// Shows every program that a law solves in this step, and changes nothing.
     pub fn inspect(
         &mut self,
         time_s: f64,
         states: &[VehicleState],
         mut show: impl FnMut(&Program, Vec<(Inequality, Row)>),
     ) -> Result<(), PoolError> {
-        self.visit(time_s, states, |law, _, situation, partners, memory| {
-            if let Some(program) = law.program(situation, partners.clone(), &mut memory.clone()) {
-                show(&program, law.row_list(situation, partners));
-            }
+        self.visit(time_s, states, |laws, mut scene| match laws {
+            Laws::Ocbf(law) => scene.each(|_, situation, partners, member| {
+                let mut memory = super::Ocbf::recall(&member.memory);
+                if let Some(program) = law.program(situation, partners.clone(), &mut memory) {
+                    show(&program, law.row_list(situation, partners));
+                }
+            }),
         })
     }
 
-    /// Calls `with` for each vehicle of the pool's zones, in frame order.
+    /// Calls `with` for each zone of the pool that has members, in frame order.
     #[inline]
     fn visit(
         &mut self,
         time_s: f64,
         states: &[VehicleState],
-        mut with: impl FnMut(&Law, &VehicleState, &Situation, Partners<'_>, &mut Memory),
+        mut with: impl FnMut(&Laws, Scene<'_>),
     ) -> Result<(), PoolError> {
         let range = self.own_range(states);
         let (mut start, end) = (range.start, range.end);
@@ -250,43 +263,28 @@ impl ControllerPool {
             fetch(&states[ahead..(ahead + slice.len()).min(end)]);
             self.members.fetch(lane + AHEAD);
             self.constraints.fetch(lane + AHEAD);
-            let present = &slice[usize::from(slice[0].flags & frames::STATE_LEFT != 0)..];
+            let left = slice.iter().take_while(|state| state.has_left()).count();
+            let present = &slice[left..];
             if present.is_empty() {
                 continue;
             }
             let members = &mut self.members[lane];
             let unassigned = PoolError::Unassigned { zone, present: present.len(), assigned: members.len() };
-            if present.len() != members.len() {
+            let fits = |(state, member): (&VehicleState, &Member)| state.vehicle == member.vehicle;
+            if present.len() != members.len() || !present.iter().zip(&*members).all(fits) {
                 return Err(unassigned);
             }
             let (lengths_m, constraints) = (&self.lengths_m[lane], &self.constraints[lane]);
-            for (state, member) in present.iter().zip(members) {
-                if state.vehicle != member.vehicle {
-                    return Err(unassigned);
-                }
-                if !self.plugged.is_empty() && self.plugged.contains(&(zone, state.path)) {
-                    continue;
-                }
-                let situation = Situation {
-                    time_s,
-                    x_m: state.x_m,
-                    v_mps: state.v_mps,
-                    entry_time_s: state.entry_time_s,
-                    entry_speed_mps: state.entry_speed_mps,
-                    length_m: lengths_m[state.path as usize],
-                    terminal: member.terminal,
-                };
-                let own = &constraints[member.first_constraint as usize..member.end_constraint as usize];
-                let partners = Partners { constraints: own.iter(), slice };
-                with(&self.law, state, &situation, partners, &mut member.memory);
-            }
+            let (plugged, kinds) = (&self.plugged, self.kinds);
+            let scene = Scene { time_s, slice, present, members, lengths_m, constraints, plugged, kinds };
+            with(&self.laws[usize::from(self.law_of[lane])], scene);
         }
         Ok(())
     }
 
     /// Whether a plug-in drives the vehicle.
     fn is_plugged(&self, state: &VehicleState) -> bool {
-        !self.plugged.is_empty() && self.plugged.contains(&(state.zone, state.path))
+        is_plugged(&self.plugged, state)
     }
 
     fn own_range(&self, states: &[VehicleState]) -> Range<usize> {
@@ -299,13 +297,66 @@ impl ControllerPool {
     }
 }
 
+/// A zone in one step.
+struct Scene<'a> {
+    time_s: f64,
+    slice: &'a [VehicleState],
+    /// Those of it that have not left.
+    present: &'a [VehicleState],
+    members: &'a mut [Member],
+    lengths_m: &'a [f64],
+    constraints: &'a [Duty],
+    plugged: &'a [(ZoneId, u32)],
+    kinds: u16,
+}
+
+impl Scene<'_> {
+    /// Lets a law decide each vehicle.
+    #[inline(always)]
+    fn decide<L: Law>(mut self, law: &L, emit: &mut impl FnMut(VehicleCommand)) {
+        self.each(|state, situation, partners, member| {
+            let mut memory = L::recall(&member.memory);
+            let decision = law.decide(situation, partners, &mut memory);
+            member.memory = L::words(&memory);
+            emit(command(state, &decision, &member.memory));
+        });
+    }
+
+    #[inline(always)]
+    fn each(&mut self, mut with: impl FnMut(&VehicleState, &Situation, Partners<'_>, &mut Member)) {
+        for (state, member) in self.present.iter().zip(&mut *self.members) {
+            if is_plugged(self.plugged, state) {
+                continue;
+            }
+            let situation = Situation {
+                time_s: self.time_s,
+                x_m: state.x_m,
+                v_mps: state.v_mps,
+                entry_time_s: state.entry_time_s,
+                entry_speed_mps: state.entry_speed_mps,
+                length_m: self.lengths_m[state.path as usize],
+                terminal: member.terminal,
+                // A kind nobody has heard of cannot be told apart from the first.
+                kind: if state.kind < self.kinds { state.kind } else { 0 },
+            };
+            let own = &self.constraints[member.first_constraint as usize..member.end_constraint as usize];
+            let partners = Partners { constraints: own.iter(), slice: self.slice, x_m: state.x_m };
+            with(state, &situation, partners, member);
+        }
+    }
+}
+
+fn is_plugged(plugged: &[(ZoneId, u32)], state: &VehicleState) -> bool {
+    !plugged.is_empty() && plugged.contains(&(state.zone, state.path))
+}
+
 impl Member {
     /// A vehicle as its controller remembered it when it sent this command.
     fn remembered(command: &VehicleCommand) -> Member {
         Member {
             vehicle: command.vehicle,
             terminal: Terminal::Free,
-            memory: memory(command),
+            memory: Words { mode: command.mode, words: command.memory() },
             first_constraint: 0,
             end_constraint: 0,
         }
@@ -320,8 +371,8 @@ fn first_of(states: &[VehicleState], zone: ZoneId, expected: usize) -> usize {
     if begins_at(expected) { expected } else { states.partition_point(|s| s.zone < zone) }
 }
 
-impl Crew {
-    /// Puts a zone's crew together from its slice and its assignments; memories are kept by vehicle.
+impl Renewed {
+    /// Puts a zone's members together from its slice and its assignments; memories are kept by vehicle.
     fn assign(
         &mut self,
         zone: ZoneId,
@@ -334,7 +385,7 @@ impl Crew {
         self.constraints.clear();
         let mut groups = assignments.chunk_by(|a, b| a.vehicle == b.vehicle);
         let mut known = before.iter().peekable();
-        for state in slice.iter().filter(|s| s.flags & frames::STATE_LEFT == 0) {
+        for state in slice.iter().filter(|state| !state.has_left()) {
             let group = groups.next().unwrap_or(&[]);
             if group.first().is_none_or(|a| a.vehicle != state.vehicle) {
                 let present = slice.len();
@@ -345,7 +396,7 @@ impl Crew {
                 match known.peek() {
                     Some(old) if old.vehicle == state.vehicle => break old.memory,
                     Some(_) if before.iter().any(|m| m.vehicle == state.vehicle) => known.next(),
-                    _ => break Memory::ENTERED,
+                    _ => break Words::ENTERED,
                 };
             };
             let first = self.constraints.len() as u32;
@@ -374,90 +425,67 @@ impl Crew {
     }
 }
 
-/// No approach is longer than this, m.
+/// No path is longer than this, m.
 const MAX_CONFLICT_M: f64 = 1e9;
 
-/// Turns an assignment into a place in the zone's slice; `None` for one without partner.
-fn resolve(slice: &[VehicleState], a: &Assignment, v_max_mps: f64) -> Result<Option<Constraint>, PoolError> {
+/// Turns an assignment into a duty toward a place in the zone's slice; `None` for one without partner.
+fn resolve(slice: &[VehicleState], a: &Assignment, v_max_mps: f64) -> Result<Option<Duty>, PoolError> {
     let malformed = PoolError::Malformed { zone: a.zone, vehicle: a.vehicle };
-    let is_distance = |m: f64| m > 0.0 && m <= MAX_CONFLICT_M;
-    // The law plans with the terminal speed of any of them.
+    let is_distance = |m: f64| (0.0..=MAX_CONFLICT_M).contains(&m);
+    let kind = match a.kind {
+        frames::CONSTRAINT_NONE => None,
+        frames::CONSTRAINT_REAR_END => Some(DutyKind::RearEnd),
+        frames::CONSTRAINT_MERGE => Some(DutyKind::Merge),
+        frames::CONSTRAINT_CROSS => Some(DutyKind::Cross),
+        _ => return Err(malformed),
+    };
+    // The law plans with the terminal speed of any of them, and divides by the distance to a conflict point.
     let sound = is_distance(a.own_conflict_m)
         && is_distance(a.partner_conflict_m)
+        && is_distance(a.gap_m)
+        && !a.until_m.is_nan()
+        && (a.own_conflict_m > 0.0 || !matches!(kind, Some(DutyKind::Merge | DutyKind::Cross)))
         && (0.0..=v_max_mps).contains(&a.terminal_speed_mps);
     if !sound {
         return Err(malformed);
     }
-    let kind = match a.kind {
-        frames::CONSTRAINT_NONE => return Ok(None),
-        frames::CONSTRAINT_REAR_END => PartnerKind::RearEnd,
-        frames::CONSTRAINT_MERGE => PartnerKind::Merge,
-        _ => return Err(malformed),
-    };
-    let partner_at = slice
+    let Some(kind) = kind else { return Ok(None) };
+    let partner = slice
         .iter()
         .position(|s| s.vehicle == a.partner)
         .ok_or(PoolError::UnknownVehicle { zone: a.zone, vehicle: a.partner })?;
-    Ok(Some(Constraint {
+    Ok(Some(Duty {
         kind,
-        partner_at: partner_at as u32,
-        shift_m: a.own_conflict_m - a.partner_conflict_m,
-        conflict_m: a.own_conflict_m,
+        partner: partner as u32,
+        point: a.point,
+        own_m: a.own_conflict_m,
+        partner_m: a.partner_conflict_m,
+        gap_m: a.gap_m,
+        until_m: a.until_m,
     }))
 }
 
 /// The wire form of a decision and the memory behind it.
-fn command(state: &VehicleState, decision: &super::Decision, memory: &Memory) -> VehicleCommand {
+#[inline(always)]
+fn command(state: &VehicleState, decision: &Decision, memory: &Words) -> VehicleCommand {
     let (verdict, binding_rows) = match decision.verdict {
         Verdict::Nominal => (frames::VERDICT_NOMINAL, 0),
         Verdict::Fe => (frames::VERDICT_FE, 0),
         Verdict::Bound(row) => (frames::VERDICT_BOUND, row as u32),
         Verdict::Infeasible => (frames::VERDICT_INFEASIBLE, 0),
     };
-    let mode = match memory.mode {
-        Mode::Fe => frames::MODE_FE,
-        Mode::Ocbf => frames::MODE_OCBF,
-    };
-    let mut command = VehicleCommand {
+    let command = VehicleCommand {
         u_mps2: decision.u_mps2,
+        planned_exit_time_s: decision.exit.0,
+        planned_exit_speed_mps: decision.exit.1,
         vehicle: state.vehicle,
         zone: state.zone,
         binding_rows,
-        mode,
+        mode: memory.mode,
         verdict,
         ..VehicleCommand::default()
     };
-    if let Some(plan) = &memory.plan {
-        command.planned_exit_time_s = plan.exit_time_s();
-        command.planned_exit_speed_mps = plan.exit_speed_mps();
-        command.plan_start_s = plan.start_s;
-        command.plan_origin_m = plan.origin_m;
-        command.plan_v0_mps = plan.v0_mps;
-        command.plan_a = plan.optimum.a;
-        command.plan_b = plan.optimum.b;
-        command.plan_duration_s = plan.optimum.duration_s;
-        command.plan_terminal_mps = match plan.terminal {
-            Terminal::Free => -1.0,
-            Terminal::Speed(w) => w,
-        };
-    }
-    command
-}
-
-/// The memory a command carries; the inverse of what [`command`] writes.
-fn memory(command: &VehicleCommand) -> Memory {
-    let plan = (command.plan_duration_s > 0.0).then_some(Reference {
-        start_s: command.plan_start_s,
-        origin_m: command.plan_origin_m,
-        v0_mps: command.plan_v0_mps,
-        optimum: Optimum { a: command.plan_a, b: command.plan_b, duration_s: command.plan_duration_s },
-        terminal: if command.plan_terminal_mps < 0.0 {
-            Terminal::Free
-        } else {
-            Terminal::Speed(command.plan_terminal_mps)
-        },
-    });
-    Memory { mode: if command.mode == frames::MODE_OCBF { Mode::Ocbf } else { Mode::Fe }, plan }
+    command.remembering(memory.words)
 }
 
 #[cfg(test)]

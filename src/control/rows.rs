@@ -29,11 +29,15 @@ pub enum Row {
     Merge = 1 << 6,
     /// Its feasibility row (`equ:candidate2`).
     MergeFeasibility = 1 << 7,
+    /// Safety at a crossing: the merging row with the distance to be kept there.
+    Cross = 1 << 8,
+    /// Its feasibility row.
+    CrossFeasibility = 1 << 9,
 }
 
 impl Row {
     /// All rows, in bit order.
-    pub const ALL: [Row; 8] = [
+    pub const ALL: [Row; 10] = [
         Row::UMin,
         Row::UMax,
         Row::VMin,
@@ -42,6 +46,8 @@ impl Row {
         Row::RearEndFeasibility,
         Row::Merge,
         Row::MergeFeasibility,
+        Row::Cross,
+        Row::CrossFeasibility,
     ];
 
     /// Short name for tables and messages.
@@ -55,6 +61,8 @@ impl Row {
             Row::RearEndFeasibility => "rear-end feasibility",
             Row::Merge => "merge",
             Row::MergeFeasibility => "merge feasibility",
+            Row::Cross => "cross",
+            Row::CrossFeasibility => "cross feasibility",
         }
     }
 }

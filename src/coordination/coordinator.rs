@@ -1,8 +1,11 @@
 //! The coordinator of a contiguous range of zones, from state and summary frames to coordination.
 
+use super::assign::Assigner;
 use super::flow::FlowController;
-use super::partners;
+use super::order::Orders;
 use super::summaries::{Audience, is_event};
+use crate::conflict::Conflicts;
+use crate::control::Terminal;
 use crate::scenario::{Scenario, ZoneId};
 use ipc_schemas::{Assignment, VehicleState, ZoneSummary};
 use std::ops::Range;
@@ -18,42 +21,76 @@ use std::sync::Arc;
 pub struct Coordinator {
     scenario: Arc<Scenario>,
     zones: Range<ZoneId>,
-    desks: Vec<Desk>,
+    posts: Vec<Post>,
+    assigner: Assigner,
+    orders: Orders,
     /// Summaries of this step to zones of this process, delivered in the next one.
     internal: Vec<ZoneSummary>,
     internal_step: u64,
     /// Summaries of this step to zones of other processes.
     external: Vec<ZoneSummary>,
     assignments: Vec<Assignment>,
-    /// Zones whose desk has been told something for this step.
+    /// Zones that have been told something for this step.
     told: Vec<ZoneId>,
 }
 
 /// What a coordinator keeps for one zone.
 #[derive(Debug)]
-struct Desk {
-    flow: FlowController,
+struct Post {
+    conflicts: Conflicts,
     audience: Audience,
-    downstream: Option<ZoneSummary>,
+    exits: Vec<ExitPost>,
+    /// Terminal condition by exit, as decided last.
+    terminals: Vec<Terminal>,
+    /// The zone's vehicles in passing order, as decided last.
+    order: Vec<u32>,
     told: bool,
+}
+
+/// What it keeps for one exit.
+#[derive(Debug)]
+struct ExitPost {
+    flow: FlowController,
+    /// The zone it leads to, and the last summary of it.
+    to: Option<ZoneId>,
+    downstream: Option<ZoneSummary>,
+}
+
+impl Post {
+    fn new(scenario: &Scenario, zone: ZoneId) -> Post {
+        let shape = &scenario.network.zones[zone as usize];
+        let exits = shape.exits.iter().map(|exit| ExitPost {
+            flow: FlowController::new(scenario, shape, exit),
+            to: exit.to.map(|to| to.zone),
+            downstream: None,
+        });
+        Post {
+            conflicts: Conflicts::of(&scenario.network, zone),
+            audience: Audience::of(&scenario.network, zone),
+            exits: exits.collect(),
+            terminals: Vec::new(),
+            order: Vec::new(),
+            told: false,
+        }
+    }
+
+    /// Keeps what a zone downstream says.
+    fn hear(&mut self, summary: &ZoneSummary) {
+        for exit in self.exits.iter_mut().filter(|exit| exit.to == Some(summary.from_zone)) {
+            exit.downstream = Some(*summary);
+        }
+    }
 }
 
 impl Coordinator {
     /// The coordinator of the given zones.
     pub fn new(scenario: Arc<Scenario>, zones: Range<ZoneId>) -> Coordinator {
-        let network = &scenario.network;
-        let desks = zones
-            .clone()
-            .map(|zone| Desk {
-                flow: FlowController::new(&scenario, zone),
-                audience: Audience::of(network, zone),
-                downstream: None,
-                told: false,
-            })
-            .collect();
+        let posts = zones.clone().map(|zone| Post::new(&scenario, zone)).collect();
         Coordinator {
             zones,
-            desks,
+            posts,
+            assigner: Assigner::default(),
+            orders: Orders::new(&scenario),
             internal: Vec::new(),
             internal_step: 0,
             external: Vec::new(),
@@ -78,23 +115,29 @@ impl Coordinator {
     pub fn receive(&mut self, summaries: &[ZoneSummary]) {
         for summary in summaries {
             if self.zones.contains(&summary.to_zone) {
-                let downstream = self.scenario.network.downstream(summary.to_zone);
-                let desk = &mut self.desks[(summary.to_zone - self.zones.start) as usize];
-                desk.told = true;
+                let post = &mut self.posts[(summary.to_zone - self.zones.start) as usize];
+                post.told = true;
                 self.told.push(summary.to_zone);
-                if downstream == Some(summary.from_zone) {
-                    desk.downstream = Some(*summary);
-                }
+                post.hear(summary);
             }
         }
     }
 
     /// Takes over from another coordinator: `downstream` are the last summaries its zones acted on, `due`
-    /// those sent in the step before the first this one acts in.
-    pub fn restore(&mut self, downstream: &[ZoneSummary], due: &[ZoneSummary]) {
+    /// those sent in the step before the first this one acts in, `in_force` the assignments of before that step.
+    pub fn restore(&mut self, downstream: &[ZoneSummary], due: &[ZoneSummary], in_force: &[Assignment]) {
+        for group in in_force.chunk_by(|a, b| a.zone == b.zone) {
+            if self.zones.contains(&group[0].zone) {
+                let mut ranks: Vec<(u32, u32)> = group.iter().map(|a| (a.rank, a.vehicle)).collect();
+                ranks.sort_unstable();
+                ranks.dedup();
+                let order = ranks.into_iter().map(|(_, vehicle)| vehicle).collect();
+                self.posts[(group[0].zone - self.zones.start) as usize].order = order;
+            }
+        }
         for summary in downstream {
             if self.zones.contains(&summary.to_zone) {
-                self.desks[(summary.to_zone - self.zones.start) as usize].downstream = Some(*summary);
+                self.posts[(summary.to_zone - self.zones.start) as usize].hear(summary);
             }
         }
         self.receive(due);
@@ -120,12 +163,12 @@ impl Coordinator {
             if !self.zones.contains(&zone) {
                 continue;
             }
-            let desk = &mut self.desks[(zone - self.zones.start) as usize];
-            let told = desk.told;
+            let post = &mut self.posts[(zone - self.zones.start) as usize];
+            let told = post.told;
             let event = is_event(slice);
             had_event |= event;
             if event {
-                for summary in desk.audience.summaries(zone, slice) {
+                for summary in post.audience.summaries(zone, slice) {
                     if self.zones.contains(&summary.to_zone) {
                         self.internal.push(summary);
                     } else {
@@ -134,13 +177,19 @@ impl Coordinator {
                 }
             }
             if event || told {
-                let terminal = desk.flow.terminal(desk.downstream.as_ref());
-                let zone = &self.scenario.network.zones[zone as usize];
-                partners::assign(zone, slice, terminal, &mut self.assignments);
+                let terminals = post.exits.iter().map(|exit| exit.flow.terminal(exit.downstream.as_ref()));
+                post.terminals.clear();
+                post.terminals.extend(terminals);
+                let Post { conflicts, terminals, order, .. } = post;
+                let policy = self.scenario.network.zones[zone as usize].order;
+                let members = &slice[slice.iter().take_while(|state| state.has_left()).count()..];
+                self.orders.update(policy, &self.scenario, conflicts, members, order);
+                let assignments = &mut self.assignments;
+                self.assigner.assign(&self.scenario, conflicts, slice, order, terminals, assignments);
             }
         }
         for zone in self.told.drain(..) {
-            self.desks[(zone - self.zones.start) as usize].told = false;
+            self.posts[(zone - self.zones.start) as usize].told = false;
         }
         had_event
     }

@@ -2,11 +2,11 @@
 //! (paper: section "Problem 2", `equ:feedback_control`).
 
 use crate::control::Terminal;
-use crate::control::law::mean_optimal_terminal_speed_mps;
-use crate::scenario::{Baseline, FlowPolicy, Scenario, Segment, ZoneId};
+use crate::control::ocbf::mean_optimal_terminal_speed_mps;
+use crate::scenario::{Baseline, Exit, FlowPolicy, Observed, Scenario, Zone};
 use ipc_schemas::ZoneSummary;
 
-/// One zone's policy, ready to be evaluated at events.
+/// One exit's policy, ready to be evaluated at events.
 #[derive(Clone, Debug)]
 pub struct FlowController {
     policy: FlowPolicy,
@@ -18,26 +18,25 @@ pub struct FlowController {
 /// Length of the downstream segment a policy observes, m (0 when it observes none).
 pub fn segment_m(policy: &FlowPolicy) -> f64 {
     match policy {
-        FlowPolicy::Feedback { segment: Segment::First(l), .. } => *l,
+        FlowPolicy::Feedback { segment: Observed::First(l), .. } => *l,
         FlowPolicy::MeanSpeed { segment_m, .. } => *segment_m,
         _ => 0.0,
     }
 }
 
 impl FlowController {
-    /// The controller of a zone; a computed baseline is computed here, once.
-    pub fn new(scenario: &Scenario, zone: ZoneId) -> FlowController {
-        let zone = &scenario.network.zones[zone as usize];
-        let baseline_mps = match &zone.flow {
+    /// The controller of an exit of a zone; a computed baseline is computed here, once.
+    pub fn new(scenario: &Scenario, zone: &Zone, exit: &Exit) -> FlowController {
+        let baseline_mps = match &exit.flow {
             FlowPolicy::Feedback { baseline: Baseline::Given(speed), .. } => *speed,
             FlowPolicy::Feedback { baseline: Baseline::Optimal(entry_speeds), .. } => {
-                let mean_length_m =
-                    zone.approaches.iter().map(|a| a.length_m).sum::<f64>() / zone.approaches.len() as f64;
+                let total_m = zone.paths.iter().map(|path| path.length_m).sum::<f64>();
+                let mean_length_m = total_m / zone.paths.len() as f64;
                 mean_optimal_terminal_speed_mps(scenario, mean_length_m, entry_speeds)
             }
             _ => 0.0,
         };
-        FlowController { policy: zone.flow.clone(), baseline_mps, v_max_mps: scenario.vehicle.v_max_mps }
+        FlowController { policy: exit.flow.clone(), baseline_mps, v_max_mps: scenario.vehicle.v_max_mps }
     }
 
     /// The terminal condition, given the last summary of the downstream zone (none before its first
@@ -48,8 +47,8 @@ impl FlowController {
             FlowPolicy::Fixed { terminal_mps } => Terminal::Speed(*terminal_mps),
             FlowPolicy::Feedback { gain_mps, segment, min_mps, .. } => {
                 let count = downstream.map_or(0, |s| match segment {
-                    Segment::Whole => s.vehicles,
-                    Segment::First(_) => s.segment_vehicles,
+                    Observed::Whole => s.vehicles,
+                    Observed::First(_) => s.segment_vehicles,
                 });
                 let speed = self.baseline_mps - gain_mps * f64::from(count);
                 Terminal::Speed(speed.max(*min_mps).min(self.v_max_mps))

@@ -1,8 +1,9 @@
 //! The coordinator role: passing order, constraint partners and terminal speed of some zones.
 
+mod assign;
 mod coordinator;
 mod flow;
-mod partners;
+mod order;
 mod summaries;
 
 pub use coordinator::Coordinator;

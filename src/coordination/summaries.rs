@@ -15,9 +15,10 @@ impl Audience {
     /// The audience of a zone.
     pub fn of(network: &Network, zone: ZoneId) -> Audience {
         let neighbours = network.neighbours(zone).map(|n| {
-            // Only the upstream neighbour's policy looks into this zone.
-            let looks = network.downstream(n) == Some(zone);
-            (n, if looks { segment_m(&network.zones[n as usize].flow) } else { 0.0 })
+            // Only policies of exits that lead here look into this zone; of several the one that looks furthest.
+            let exits = network.zones[n as usize].exits.iter();
+            let looking = exits.filter(|exit| exit.to.is_some_and(|to| to.zone == zone));
+            (n, looking.map(|exit| segment_m(&exit.flow)).fold(0.0, f64::max))
         });
         Audience(neighbours.collect())
     }

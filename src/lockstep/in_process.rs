@@ -103,6 +103,7 @@ impl InProcess {
         let coordinator_inboxes: Vec<_> =
             coordinator_states.iter().zip(&summaries).map(|(c, s)| (c.inbox(), s.inbox())).collect();
         let command_inbox = command.inbox();
+        let coordination_inbox = coordination.inbox();
         let observer = observed.then(|| Observer {
             state: state.tap(),
             summaries: summaries.iter().map(MemoryService::tap).collect(),
@@ -144,7 +145,7 @@ impl InProcess {
             state: state.outbox(),
             coordinator_states: coordinator_states.iter().map(MemoryService::outbox).collect(),
             command: command_inbox,
-            coordination: None,
+            coordination: Some(coordination_inbox),
         };
         InProcess {
             world: WorldDriver::new(world, ports, run_id, controllers),
@@ -195,7 +196,19 @@ impl InProcess {
                     progress = true;
                 }
             }
-            assert!(progress, "lockstep: every role waits for another in step {step}");
+            if !progress {
+                let mut all = vec![self.world.advance()?];
+                for coordinator in &mut self.coordinators {
+                    all.push(coordinator.advance()?);
+                }
+                for controller in &mut self.controllers {
+                    all.push(controller.advance()?);
+                }
+                panic!(
+                    "lockstep: every role waits for another in step {step}: {all:?}; refused: {:?}",
+                    self.world.refused()
+                );
+            }
         }
     }
 

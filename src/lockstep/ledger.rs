@@ -27,7 +27,7 @@ pub struct Handover {
     pub coordination: Vec<(u16, Vec<Assignment>)>,
     /// To a controller: its commands of the step before.
     pub commands: Vec<VehicleCommand>,
-    /// To a controller: assignments in force before that step, by zone.
+    /// Assignments in force before that step, by zone.
     pub in_force: Vec<Assignment>,
     /// To a coordinator: the last summaries its zones acted on.
     pub downstream: Vec<ZoneSummary>,
@@ -62,9 +62,8 @@ impl Handover {
 pub struct Ledger {
     audiences: Vec<Audience>,
     in_force: Vec<Vec<Assignment>>,
-    /// Per zone, the last summary of its downstream neighbour it acted on.
-    downstream: Vec<Option<ZoneSummary>>,
-    downstream_zone: Vec<Option<u32>>,
+    /// Per zone, the last summary of each zone downstream it acted on.
+    downstream: Vec<Vec<(u32, Option<ZoneSummary>)>>,
     due: Vec<ZoneSummary>,
     fresh: Vec<ZoneSummary>,
     coordination: Vec<(u16, Vec<Assignment>)>,
@@ -86,8 +85,9 @@ impl Ledger {
         Ledger {
             audiences: (0..zones as u32).map(|zone| Audience::of(network, zone)).collect(),
             in_force: vec![Vec::new(); zones],
-            downstream: vec![None; zones],
-            downstream_zone: (0..zones as u32).map(|zone| network.downstream(zone)).collect(),
+            downstream: (0..zones as u32)
+                .map(|zone| network.downstream(zone).map(|next| (next, None)).collect())
+                .collect(),
             due: Vec::new(),
             fresh: Vec::new(),
             coordination: Vec::new(),
@@ -102,9 +102,9 @@ impl Ledger {
     pub fn begin(&mut self, states: &[VehicleState], is_event_step: bool) {
         self.has_begun = true;
         for summary in self.due.drain(..) {
-            let zone = summary.to_zone as usize;
-            if self.downstream_zone[zone] == Some(summary.from_zone) {
-                self.downstream[zone] = Some(summary);
+            let known = self.downstream[summary.to_zone as usize].iter_mut();
+            for (_, last) in known.filter(|(zone, _)| *zone == summary.from_zone) {
+                *last = Some(summary);
             }
         }
         std::mem::swap(&mut self.due, &mut self.fresh);
@@ -200,15 +200,24 @@ impl Ledger {
     }
 
     fn to_coordinator(&self) -> Handover {
-        let downstream = self.downstream.iter().flatten().copied();
+        let downstream = self.downstream.iter().flatten().filter_map(|(_, last)| *last);
+        let in_force = self.in_force.concat();
         if self.has_begun {
             let (due, fresh) = (self.due.clone(), self.fresh.clone());
-            return Handover { downstream: downstream.collect(), due, fresh, ..Handover::default() };
+            return Handover {
+                downstream: downstream.collect(),
+                due,
+                fresh,
+                in_force,
+                ..Handover::default()
+            };
         }
         // What was due in the last step has been acted on, and what was fresh is due.
-        let acted_on =
-            self.due.iter().filter(|s| self.downstream_zone[s.to_zone as usize] == Some(s.from_zone));
+        let is_downstream = |s: &&ZoneSummary| {
+            self.downstream[s.to_zone as usize].iter().any(|(zone, _)| *zone == s.from_zone)
+        };
+        let acted_on = self.due.iter().filter(is_downstream);
         let downstream = downstream.chain(acted_on.copied()).collect();
-        Handover { downstream, due: self.fresh.clone(), ..Handover::default() }
+        Handover { downstream, due: self.fresh.clone(), in_force, ..Handover::default() }
     }
 }

@@ -1,41 +1,59 @@
 //! What a plug-in is told of the run: the numbers of the scenario as fixed-layout records.
 
 use crate::scenario::{
-    Drivers, Exit, FeConditions, PositionFeedback, ReferenceLaw, Replan, SafetyRows, Scenario,
+    Drivers, FeConditions, PositionFeedback, ReferenceLaw, Replan, SafetyRows, Scenario, VehicleParams,
 };
-use ipc_schemas::{self as frames, ApproachSpec, RunSpec, bytes_of};
+use ipc_schemas::{self as frames, KindSpec, PathSpec, RunSpec, bytes_of};
 
-/// The bytes behind the reply to a plug-in: a [`RunSpec`], its [`ApproachSpec`]s, and their names.
+/// The bytes behind the reply to a plug-in: a [`RunSpec`], its [`PathSpec`]s and [`KindSpec`]s, and the names of paths.
 pub fn plugin_bytes(scenario: &Scenario, drivers: &Drivers, index: u32) -> Vec<u8> {
-    let approaches: Vec<ApproachSpec> = approaches(scenario, drivers, index).collect();
-    let spec = RunSpec { approaches: approaches.len() as u32, ..spec(scenario) };
+    let paths: Vec<PathSpec> = paths(scenario, drivers, index).collect();
+    let kinds: Vec<KindSpec> = scenario.fleet.iter().map(|kind| kind_spec(&kind.vehicle)).collect();
+    let spec = RunSpec { paths: paths.len() as u32, kinds: kinds.len() as u32, ..spec(scenario) };
     let mut bytes = bytes_of(&[spec]).to_vec();
-    bytes.extend_from_slice(bytes_of(&approaches));
+    bytes.extend_from_slice(bytes_of(&paths));
+    bytes.extend_from_slice(bytes_of(&kinds));
     for zone in &scenario.network.zones {
-        for approach in &zone.approaches {
-            bytes.extend_from_slice(format!("{}.{}\n", zone.name, approach.name).as_bytes());
+        for path in &zone.paths {
+            bytes.extend_from_slice(format!("{}.{}\n", zone.name, path.name).as_bytes());
         }
     }
     bytes
 }
 
-fn approaches<'a>(
+fn paths<'a>(
     scenario: &'a Scenario,
     drivers: &'a Drivers,
     index: u32,
-) -> impl Iterator<Item = ApproachSpec> + 'a {
+) -> impl Iterator<Item = PathSpec> + 'a {
     (0..).zip(&scenario.network.zones).flat_map(move |(zone, z)| {
-        (0..).zip(&z.approaches).map(move |(path, approach)| {
-            let (next_zone, next_path, link_m) = match z.exit {
-                Exit::Out => (frames::NO_ZONE, 0, 0.0),
-                Exit::Zone { zone, path, link_m, .. } => (zone, path, link_m),
-            };
+        (0..).zip(&z.paths).map(move |(path, shape)| {
+            let to = z.exit_of(path).to;
             let controller = drivers.of(zone, path);
-            let flags = if controller == index { frames::APPROACH_OWN } else { 0 };
-            let length_m = approach.length_m;
-            ApproachSpec { length_m, link_m, zone, path, next_zone, next_path, controller, flags }
+            PathSpec {
+                length_m: shape.length_m,
+                link_m: to.map_or(0.0, |to| to.link_m),
+                zone,
+                path,
+                exit: shape.exit,
+                next_zone: to.map_or(frames::NO_ZONE, |to| to.zone),
+                controller,
+                flags: if controller == index { frames::PATH_OWN } else { 0 },
+            }
         })
     })
+}
+
+fn kind_spec(vehicle: &VehicleParams) -> KindSpec {
+    KindSpec {
+        u_min_mps2: vehicle.u_min_mps2,
+        u_max_mps2: vehicle.u_max_mps2,
+        v_min_mps: vehicle.v_min_mps,
+        v_max_mps: vehicle.v_max_mps,
+        length_m: vehicle.length_m,
+        reaction_time_s: vehicle.reaction_time_s,
+        standstill_gap_m: vehicle.standstill_gap_m,
+    }
 }
 
 fn spec(scenario: &Scenario) -> RunSpec {
@@ -70,7 +88,9 @@ fn spec(scenario: &Scenario) -> RunSpec {
         dt_ns: scenario.dt_ns,
         seed: scenario.seed,
         zones: scenario.network.zones.len() as u32,
-        approaches: 0,
+        paths: 0,
+        kinds: 0,
+        reserved: 0,
         law_flags: law.iter().filter(|(on, _)| *on).map(|(_, flag)| flag).sum(),
         // The frame's codes are in the order of the variants.
         shield: scenario.shield as u32,

@@ -161,6 +161,6 @@ pub(super) fn rope_of(bells: &Bells, wait: WaitMode, role: Role, index: u32) -> 
 /// only decides how much memory is laid out at first.
 pub fn expected_vehicles(scenario: &Scenario) -> usize {
     const DENSE_SPACING_M: f64 = 12.0;
-    let lengths = scenario.network.zones.iter().flat_map(|z| z.approaches.iter().map(|a| a.length_m));
+    let lengths = scenario.network.zones.iter().flat_map(|z| z.paths.iter().map(|path| path.length_m));
     lengths.map(|l| (l / DENSE_SPACING_M).ceil() as usize + 2).sum()
 }

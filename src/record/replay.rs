@@ -395,10 +395,10 @@ fn flaw_of_states(scenario: &Scenario, states: &[VehicleState]) -> Option<String
             && within(state.entry_time_s, 0.0, MAX_S)
             && within(state.entry_speed_mps, 0.0, MAX_MPS);
         let place = scenario.network.zones.get(state.zone as usize);
-        let on_path = place.is_some_and(|zone| (state.path as usize) < zone.approaches.len());
+        let on_path = place.is_some_and(|zone| (state.path as usize) < zone.paths.len());
         let sound = state.zone >= last
             && (on_path || state.zone == NO_ZONE)
-            && (is_first || state.flags & STATE_LEFT == 0)
+            && (is_first || state.flags & STATE_LEFT == 0 || states[i - 1].flags & STATE_LEFT != 0)
             && numbers;
         if !sound {
             return Some(format!("the recorded state of vehicle {} is none a world sends", state.vehicle));

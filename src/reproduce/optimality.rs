@@ -7,8 +7,9 @@
 
 use super::ReproduceError;
 use super::grid::{Entry, Grid, number};
+use crate::conflict::DutyKind;
 use crate::control::reference::Problem;
-use crate::control::{Law, Memory, Partner, PartnerKind, Situation, Terminal};
+use crate::control::{Law, Memory, Ocbf, Partner, Situation, Terminal};
 use crate::scenario::{self, ReferenceLaw, Scenario};
 use crate::vehicle::Held;
 use clarabel::algebra::CscMatrix;
@@ -237,7 +238,7 @@ impl Rows {
 
 /// Duration and cost of the built-in law behind the leader.
 fn drive(scenario: &Scenario, problem: &Problem, leader: Option<Leader>) -> (f64, f64) {
-    let law = Law::new(scenario);
+    let law = Ocbf::new(scenario);
     let (dt_s, mut memory) = (scenario.dt_s(), Memory::ENTERED);
     let (mut time_s, mut x_m, mut v_mps, mut energy) = (0.0, 0.0, problem.v0_mps, 0.0);
     loop {
@@ -249,13 +250,15 @@ fn drive(scenario: &Scenario, problem: &Problem, leader: Option<Leader>) -> (f64
             entry_speed_mps: problem.v0_mps,
             length_m: problem.length_m,
             terminal: problem.terminal,
+            kind: 0,
         };
         let partner = leader.map(|l| Partner {
-            kind: PartnerKind::RearEnd,
+            kind: DutyKind::RearEnd,
             x_m: l.x_m + l.v_mps * time_s,
             v_mps: l.v_mps,
             u_mps2: 0.0,
             conflict_m: problem.length_m,
+            gap_m: scenario.vehicle.standstill_gap_m,
         });
         let decision = law.decide(&situation, partner.into_iter(), &mut memory);
         let held = Held::new(x_m, v_mps, decision.u_mps2);

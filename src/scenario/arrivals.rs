@@ -64,7 +64,7 @@ impl PoissonStream {
         let time_s = round(self.instant(exposure)?, 1e6);
         let speed_mps = draw_speed(&self.process.speed, &mut self.random);
         self.free_from_s = time_s + self.process.min_headway_s;
-        Some(Arrival { time_s, speed_mps })
+        Some(Arrival { time_s, speed_mps, route: None })
     }
 
     /// The instant at which the hazard accumulated since the road became free reaches `exposure`.
@@ -119,7 +119,7 @@ mod tests {
             .collect();
         let speed = SpeedDistribution { mean_mps: 16.0, sd_mps: 1.2, min_mps: 14.0, max_mps: 17.5 };
         let demand = Demand::Poisson(Poisson { rates, min_headway_s, speed });
-        Road { name: "r".into(), zone: 0, path: 0, demand }
+        Road { name: "r".into(), zone: 0, segment: 0, demand, routes: Vec::new() }
     }
 
     fn arrivals(road: &Road, index: u32, seed: u64) -> Vec<Arrival> {

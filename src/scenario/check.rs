@@ -5,10 +5,10 @@
 
 use super::ranges::{self, Range};
 use super::{
-    Baseline, Demand, Exit, Faults, FlowPolicy, Network, Poisson, Scenario, Scope, Segment, SensorKind,
-    Source, Span, VehicleParams, Zone,
+    Baseline, Demand, Exit, Faults, FlowPolicy, Network, Observed, Path, Poisson, Scenario, Scope,
+    SensorKind, Source, Span, VehicleParams, Zone,
 };
-use crate::scenario::load::{MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_RATE_PER_HOUR, MAX_TIME_S};
+use crate::scenario::load::{MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_KINDS, MAX_RATE_PER_HOUR, MAX_TIME_S};
 
 /// The first thing in a scenario that is not as the loader leaves it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -40,6 +40,13 @@ impl Scenario {
         require(self.max_vehicles != Some(0), || "max_vehicles = 0".to_owned())?;
         within("beta", self.beta, &ranges::BETA)?;
         vehicle(&self.vehicle)?;
+        require(!self.fleet.is_empty() && self.fleet.len() <= MAX_KINDS, || "the fleet".to_owned())?;
+        for kind in &self.fleet {
+            vehicle(&kind.vehicle)?;
+            within("share", kind.share, &ranges::SHARE)?;
+            // Steps and paths are sized for the fastest.
+            number("v_max_mps", kind.vehicle.v_max_mps, |v| v <= self.vehicle.v_max_mps)?;
+        }
         let control = &self.control;
         for (what, gain) in [
             ("k_rear_end_per_s", control.k_rear_end_per_s),
@@ -52,11 +59,11 @@ impl Scenario {
         within("slack_weight", control.slack_weight, &ranges::SLACK_WEIGHT)?;
         number("fe_fraction", control.fe_fraction, |f| f > 0.0 && f <= 1.0)?;
         network(&self.network, self.vehicle.v_max_mps * dt_s, self.vehicle.v_max_mps)?;
-        for zone in &self.network.zones {
-            flow(zone, &self.network, self.vehicle.v_max_mps)?;
+        for exit in self.network.zones.iter().flat_map(|zone| &zone.exits) {
+            flow(exit, &self.network, self.vehicle.v_max_mps)?;
         }
         for road in &self.network.roads {
-            demand(&road.demand, &self.vehicle)
+            demand(&road.demand, &self.vehicle, road.routes.len())
                 .map_err(|fault| ScenarioFault(format!("road {}: {fault}", road.name)))?;
         }
         self.check_plugins()?;
@@ -98,13 +105,13 @@ impl Scenario {
 
     fn check_scope(&self, scope: &Scope) -> Check {
         number("fraction", scope.fraction, |f| f > 0.0 && f <= 1.0)?;
-        let Some(approaches) = &scope.approaches else { return Ok(()) };
+        let Some(paths) = &scope.paths else { return Ok(()) };
         let there = |&(zone, path): &(u32, u32)| {
-            self.network.zones.get(zone as usize).is_some_and(|z| (path as usize) < z.approaches.len())
+            self.network.zones.get(zone as usize).is_some_and(|z| (path as usize) < z.paths.len())
         };
-        let ascend = approaches.windows(2).all(|w| w[0] < w[1]);
-        let is_sound = !approaches.is_empty() && ascend && approaches.iter().all(there);
-        require(is_sound, || "a fault's approaches".to_owned())
+        let ascend = paths.windows(2).all(|w| w[0] < w[1]);
+        let is_sound = !paths.is_empty() && ascend && paths.iter().all(there);
+        require(is_sound, || "a fault's paths".to_owned())
     }
 
     fn check_plugins(&self) -> Check {
@@ -112,11 +119,11 @@ impl Scenario {
         let mut driven = std::collections::BTreeSet::new();
         for plugin in &self.plugins {
             let bad = || format!("controller {}", plugin.name);
-            require(names.insert(&plugin.name) && !plugin.approaches.is_empty(), bad)?;
-            require(plugin.approaches.is_sorted(), bad)?;
-            for &(zone, path) in &plugin.approaches {
+            require(names.insert(&plugin.name) && !plugin.paths.is_empty(), bad)?;
+            require(plugin.paths.is_sorted(), bad)?;
+            for &(zone, path) in &plugin.paths {
                 let there = self.network.zones.get(zone as usize);
-                let there = there.is_some_and(|z| (path as usize) < z.approaches.len());
+                let there = there.is_some_and(|z| (path as usize) < z.paths.len());
                 require(there && driven.insert((zone, path)), bad)?;
             }
         }
@@ -140,7 +147,7 @@ fn vehicle(v: &VehicleParams) -> Check {
     within("standstill_gap_m", v.standstill_gap_m, &ranges::STANDSTILL_GAP)
 }
 
-/// Indices point at something, both ends of a connection know of each other, and zones come upstream first.
+/// Indices point at something, both ends of a connection know of each other, and every zone has a way out.
 fn network(network: &Network, step_m: f64, v_max_mps: f64) -> Check {
     let (zones, roads) = (&network.zones, &network.roads);
     require(!zones.is_empty() && zones.len() <= MAX_COUNT, || format!("{} zones", zones.len()))?;
@@ -148,49 +155,114 @@ fn network(network: &Network, step_m: f64, v_max_mps: f64) -> Check {
     let mut roads_used = 0;
     for (index, zone) in (0..).zip(zones) {
         let bad = || format!("zone {}: the network does not hang together", zone.name);
-        require(!zone.approaches.is_empty() && zone.approaches.len() <= MAX_COUNT, bad)?;
-        for (path, approach) in (0..).zip(&zone.approaches) {
-            within("length_m", approach.length_m, &ranges::APPROACH_LENGTH)?;
-            number("length_m", approach.length_m, |l| l >= step_m)?;
-            match approach.source {
-                Source::Road(road) => {
+        lanes(zone, step_m)?;
+        for (at, segment) in (0..).zip(&zone.segments) {
+            match segment.source {
+                None => {}
+                Some(Source::Road(road)) => {
                     let road = roads.get(road as usize);
-                    require(road.is_some_and(|r| (r.zone, r.path) == (index, path)), bad)?;
+                    require(road.is_some_and(|r| (r.zone, r.segment) == (index, at)), bad)?;
                     roads_used += 1;
                 }
-                Source::Zone(up) => {
-                    let exit = zones.get(up as usize).map(|z| z.exit);
-                    let here =
-                        |exit| matches!(exit, Exit::Zone { zone, path: p, .. } if (zone, p) == (index, path));
-                    require(up < index && exit.is_some_and(here), bad)?;
+                Some(Source::Zone { zone: up, exit }) => {
+                    let exit = zones.get(up as usize).and_then(|z| z.exits.get(exit as usize));
+                    let to = exit.and_then(|exit| exit.to);
+                    require(to.is_some_and(|to| (to.zone, to.segment) == (index, at)), bad)?;
                 }
             }
         }
-        if let Exit::Zone { zone: down, path, link_m, link_speed_mps } = zone.exit {
-            let source = zones.get(down as usize).and_then(|z| z.approaches.get(path as usize));
-            require(source.is_some_and(|a| a.source == Source::Zone(index)), bad)?;
-            within("link_m", link_m, &ranges::LINK_LENGTH)?;
-            number("link_m", link_m, |l| l == 0.0 || l >= step_m)?;
-            number("link_speed_mps", link_speed_mps, |v| ranges::LINK_SPEED.contains(v) && v <= v_max_mps)?;
+        for (at, exit) in (0..).zip(&zone.exits) {
+            let Some(to) = exit.to else { continue };
+            let there = zones.get(to.zone as usize).and_then(|z| z.segments.get(to.segment as usize));
+            let source = Source::Zone { zone: index, exit: at };
+            require(there.is_some_and(|segment| segment.source == Some(source)), bad)?;
+            within("link_m", to.link_m, &ranges::LINK_LENGTH)?;
+            number("link_m", to.link_m, |l| l == 0.0 || l >= step_m)?;
+            let is_speed = |v| ranges::LINK_SPEED.contains(v) && v <= v_max_mps;
+            number("link_speed_mps", to.link_speed_mps, is_speed)?;
+        }
+    }
+    let is_way_out = |zone: &Zone| zone.exits.iter().any(|exit| exit.to.is_none());
+    let mut has_way: Vec<bool> = zones.iter().map(is_way_out).collect();
+    let mut found: Vec<usize> = (0..zones.len()).filter(|&zone| has_way[zone]).collect();
+    while let Some(zone) = found.pop() {
+        for feeder in network.upstream(zone as u32) {
+            if !std::mem::replace(&mut has_way[feeder as usize], true) {
+                found.push(feeder as usize);
+            }
+        }
+    }
+    require(has_way.iter().all(|has| *has), || "a zone from which nobody comes out".to_owned())?;
+    for road in roads {
+        for route in &road.routes {
+            within("share", route.share, &ranges::SHARE)?;
+            let (mut at, mut segment) = (Some(road.zone), road.segment);
+            for &path in &route.paths {
+                let zone = at.map(|zone| &zones[zone as usize]);
+                let leads = zone.is_some_and(|zone| zone.paths_from(segment).any(|p| p == path));
+                require(leads, || format!("road {}: a route that leads nowhere", road.name))?;
+                let to = zone.and_then(|zone| zone.exit_of(path).to);
+                (at, segment) = (to.map(|to| to.zone), to.map_or(0, |to| to.segment));
+            }
         }
     }
     require(roads_used == roads.len(), || "a road that leads nowhere".to_owned())
 }
 
-fn flow(zone: &Zone, network: &Network, v_max_mps: f64) -> Check {
+/// What a zone has inside.
+fn lanes(zone: &Zone, step_m: f64) -> Check {
+    let bad = || format!("zone {}: its paths do not hang together", zone.name);
+    for count in [zone.segments.len(), zone.paths.len(), zone.exits.len()] {
+        require((1..=MAX_COUNT).contains(&count), bad)?;
+    }
+    let mut is_used = vec![false; zone.segments.len()];
+    let mut is_left_by = vec![false; zone.exits.len()];
+    for segment in &zone.segments {
+        within("length_m", segment.length_m, &ranges::SEGMENT_LENGTH)?;
+        require(segment.shape.iter().flatten().all(|m| m.abs() <= 1e7), bad)?;
+        require(segment.shape.len() != 1, bad)?;
+    }
+    for path in &zone.paths {
+        let mut length_m = 0.0;
+        require(!path.segments.is_empty() && path.segments.len() <= zone.segments.len(), bad)?;
+        for (place, &at) in path.segments.iter().enumerate() {
+            let segment = zone.segments.get(at as usize);
+            require(segment.is_some_and(|s| s.source.is_some() == (place == 0)), bad)?;
+            require(!path.segments[..place].contains(&at), bad)?;
+            is_used[at as usize] = true;
+            length_m += segment.map_or(0.0, |s| s.length_m);
+        }
+        require(path.length_m == length_m, bad)?;
+        within("length_m", length_m, &ranges::APPROACH_LENGTH)?;
+        number("length_m", length_m, |l| l >= step_m)?;
+        within("share", path.share, &ranges::SHARE)?;
+        require((path.exit as usize) < zone.exits.len(), bad)?;
+        is_left_by[path.exit as usize] = true;
+    }
+    require(is_used.iter().chain(&is_left_by).all(|used| *used), bad)?;
+    for crossing in &zone.crossings {
+        within("length_m", crossing.length_m, &ranges::CROSSING_LENGTH)?;
+        require(crossing.places.len() >= 2, bad)?;
+        for &(segment, at_m) in &crossing.places {
+            let segment = zone.segments.get(segment as usize);
+            require(segment.is_some_and(|s| (0.0..=s.length_m).contains(&at_m)), bad)?;
+        }
+        let passed = |path: &Path| crossing.places.iter().filter(|(s, _)| path.segments.contains(s)).count();
+        require(zone.paths.iter().all(|path| passed(path) <= 1), bad)?;
+    }
+    Ok(())
+}
+
+fn flow(exit: &Exit, network: &Network, v_max_mps: f64) -> Check {
     let speed = |what, value| number(what, value, |v| ranges::FLOW_SPEED.contains(v) && v <= v_max_mps);
-    let downstream = match zone.exit {
-        Exit::Out => None,
-        Exit::Zone { zone, .. } => Some(&network.zones[zone as usize]),
-    };
-    let longest_m = |zone: &Zone| zone.approaches.iter().map(|a| a.length_m).fold(0.0, f64::max);
+    let downstream = exit.to.map(|to| &network.zones[to.zone as usize]);
     let observes = |l: f64| {
-        let longest_m = downstream.map_or(0.0, longest_m);
+        let longest_m = downstream.map_or(0.0, Zone::longest_m);
         number("segment_m", l, |l| l > 0.0 && l <= longest_m)
     };
     let has_downstream =
-        || require(downstream.is_some(), || format!("zone {}: nothing to observe", zone.name));
-    match &zone.flow {
+        || require(downstream.is_some(), || format!("exit {}: nothing to observe", exit.name));
+    match &exit.flow {
         FlowPolicy::None => Ok(()),
         FlowPolicy::Fixed { terminal_mps } => speed("terminal_mps", *terminal_mps),
         FlowPolicy::Feedback { baseline, gain_mps, segment, min_mps } => {
@@ -205,8 +277,8 @@ fn flow(zone: &Zone, network: &Network, v_max_mps: f64) -> Check {
             within("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
             speed("min_mps", *min_mps)?;
             match segment {
-                Segment::Whole => Ok(()),
-                Segment::First(l) => observes(*l),
+                Observed::Whole => Ok(()),
+                Observed::First(l) => observes(*l),
             }
         }
         FlowPolicy::MeanSpeed { offset_mps, gain_mps, segment_m, min_mps } => {
@@ -219,7 +291,7 @@ fn flow(zone: &Zone, network: &Network, v_max_mps: f64) -> Check {
     }
 }
 
-fn demand(demand: &Demand, vehicle: &VehicleParams) -> Check {
+fn demand(demand: &Demand, vehicle: &VehicleParams, routes: usize) -> Check {
     let VehicleParams { v_min_mps, v_max_mps, .. } = *vehicle;
     let Poisson { rates, min_headway_s, speed } = match demand {
         Demand::Poisson(process) => process,
@@ -228,6 +300,8 @@ fn demand(demand: &Demand, vehicle: &VehicleParams) -> Check {
             for arrival in arrivals {
                 number("time_s", arrival.time_s, |t| t >= last_s && t <= MAX_TIME_S)?;
                 number("speed_mps", arrival.speed_mps, |v| v >= v_min_mps && v <= v_max_mps)?;
+                let is_known = arrival.route.is_none_or(|route| (route as usize) < routes);
+                require(is_known, || format!("route = {:?}", arrival.route))?;
                 last_s = arrival.time_s;
             }
             return Ok(());
@@ -262,8 +336,7 @@ mod tests {
                 assert_eq!(load_embedded(name, &[], Some(seed)).unwrap().check(), Ok(()), "{name}");
             }
         }
-        let sets =
-            ["controllers=[{name=\"a\",zones=[\"merge-1\"]},{name=\"b\",approaches=[\"merge-2.main\"]}]"];
+        let sets = ["controllers=[{name=\"a\",zones=[\"merge-1\"]},{name=\"b\",paths=[\"merge-2.main\"]}]"];
         let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
         assert_eq!(load(None, &sets, None).unwrap().check(), Ok(()));
         assert_eq!(crate::bench::corridors(500, 60.0).unwrap().check(), Ok(()));
@@ -284,8 +357,8 @@ mod tests {
             |s| s.vehicle.u_min_mps2 = 1.0,
             |s| s.control.fe_fraction = 2.0,
             |s| s.network.zones.clear(),
-            |s| s.network.zones[0].approaches.clear(),
-            |s| s.network.zones[1].approaches[0].length_m = 0.0,
+            |s| s.network.zones[0].paths.clear(),
+            |s| s.network.zones[1].paths[0].length_m = 0.0,
             |s| s.network.zones.swap(0, 1),
             |s| s.network.roads[0].zone = 99,
             |s| {
@@ -295,11 +368,12 @@ mod tests {
                 s.network.roads[0].demand = crate::scenario::Demand::Trace(vec![crate::scenario::Arrival {
                     time_s: -1.0,
                     speed_mps: 9.0,
+                    route: None,
                 }])
             },
             |s| {
-                let approaches = vec![(7, 0)];
-                s.plugins = vec![crate::scenario::Plugin { name: "p".into(), approaches, command: None }];
+                let paths = vec![(7, 0)];
+                s.plugins = vec![crate::scenario::Plugin { name: "p".into(), paths, command: None }];
             },
             |s| s.faults = Some(Faults::default()),
             |s| faults(s).noise.as_mut().unwrap().position_sd_m = -1.0,
@@ -308,7 +382,7 @@ mod tests {
             |s| faults(s).sensors[0].scope.fraction = 0.0,
             |s| faults(s).commands.as_mut().unwrap().loss = 1.1,
             |s| faults(s).commands.as_mut().unwrap().delay_steps = 0,
-            |s| faults(s).stalls[0].scope.approaches = Some(vec![(1, 0), (0, 7)]),
+            |s| faults(s).stalls[0].scope.paths = Some(vec![(1, 0), (0, 7)]),
         ];
         let sound = Scenario { faults: load_embedded("faulty-sensors", &[], None).unwrap().faults, ..sound };
         assert_eq!(sound.check(), Ok(()));

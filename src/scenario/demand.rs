@@ -18,6 +18,8 @@ pub struct Arrival {
     pub time_s: f64,
     /// Speed at that instant, m/s.
     pub speed_mps: f64,
+    /// The route it takes: index in its road's routes; drawn when absent.
+    pub route: Option<u32>,
 }
 
 /// Shifted-Poisson arrivals: headway = minimum headway + exponential, with the mean set by the rate.

@@ -1,12 +1,16 @@
 //! Scenarios and arrival traces that are part of the program, so that it runs from any directory.
 
 /// Name and text, the default first.
-pub(super) const SCENARIOS: [(&str, &str); 5] = [
+pub(super) const SCENARIOS: [(&str, &str); 9] = [
     ("two-merges", include_str!("../../scenarios/two-merges.toml")),
     ("varying-demand", include_str!("../../scenarios/varying-demand.toml")),
     ("corridor-8", include_str!("../../scenarios/corridor-8.toml")),
     ("tree", include_str!("../../scenarios/tree.toml")),
     ("faulty-sensors", include_str!("../../scenarios/faulty-sensors.toml")),
+    ("intersection", include_str!("../../scenarios/intersection.toml")),
+    ("roundabout", include_str!("../../scenarios/roundabout.toml")),
+    ("lane-drop", include_str!("../../scenarios/lane-drop.toml")),
+    ("grid-3x3", include_str!("../../scenarios/grid-3x3.toml")),
 ];
 
 macro_rules! traces {

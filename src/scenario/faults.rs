@@ -32,11 +32,11 @@ impl Span {
     }
 }
 
-/// Part of the vehicles: those on some approaches, and of these a fraction.
+/// Part of the vehicles: those on some paths, and of these a fraction.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Scope {
     /// Zone and path, ascending; everywhere, links included, when absent.
-    pub approaches: Option<Vec<(ZoneId, u32)>>,
+    pub paths: Option<Vec<(ZoneId, u32)>>,
     /// Probability with which a vehicle belongs to it, for its whole life; 0 < fraction <= 1.
     pub fraction: f64,
 }
@@ -44,7 +44,7 @@ pub struct Scope {
 impl Scope {
     /// Whether the place belongs to it; a link has no zone's index.
     pub fn reaches(&self, zone: ZoneId, path: u32) -> bool {
-        self.approaches.as_ref().is_none_or(|all| all.binary_search(&(zone, path)).is_ok())
+        self.paths.as_ref().is_none_or(|all| all.binary_search(&(zone, path)).is_ok())
     }
 }
 

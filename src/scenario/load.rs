@@ -10,6 +10,7 @@ mod error;
 mod faults;
 mod overrides;
 mod plugins;
+mod routes;
 mod scope;
 mod sections;
 mod table;
@@ -18,11 +19,12 @@ mod topology;
 pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;
 
-use super::{Network, Road, Scenario, ShieldMode, embedded, ranges};
+use super::{LawKind, Network, Road, Scenario, ShieldMode, embedded, ranges};
 use demand::{DemandReader, TraceBase};
 pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
 pub(super) use faults::{MAX_DELAY, MAX_ERROR};
+pub(super) use sections::MAX_KINDS;
 use std::collections::BTreeMap;
 use std::path::Path;
 use table::Table;
@@ -155,6 +157,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         "objective",
         "control",
         "shield",
+        "fleet",
         "roads",
         "zones",
         "controllers",
@@ -172,43 +175,36 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let vehicle = sections::vehicle(section("vehicle")?.as_ref())?;
     let objective = root.need("objective", "a table with alpha or beta")?.table("a table")?;
     let beta = sections::beta(&objective, &vehicle)?;
-    let control = sections::control(section("control")?.as_ref(), beta)?;
+    let control_table = section("control")?;
+    let control = sections::control(control_table.as_ref(), beta)?;
+    let fleet = sections::fleet(&root, &vehicle)?;
 
     let road_tables = root.tables("roads", "a list of entry roads, at least one")?;
     let zone_tables = root.tables("zones", "a list of zones, at least one")?;
     for table in &road_tables {
-        table.only(&["name", "demand"])?;
+        table.only(&["name", "demand", "routes"])?;
     }
     for table in &zone_tables {
-        table.only(&["name", "flow", "approaches"])?;
+        table.only(&topology::ZONE_KEYS)?;
     }
+    let law = sections::law(control_table.as_ref(), LawKind::default())?;
     let road_names = topology::unique_names(&road_tables, "road")?;
     let zone_names = topology::unique_names(&zone_tables, "zone")?;
     let step_m = vehicle.v_max_mps * dt_s;
-    let mut topology =
-        topology::read(&zone_tables, &zone_names, &road_tables, &road_names, (step_m, vehicle.v_max_mps))?;
+    let mut topology = topology::read(&zone_tables, &zone_names, &road_tables, &road_names, (step_m, vehicle.v_max_mps), law)?;
 
-    let policies = topology.zones.iter().zip(&topology.declared).map(|(zone, &declared)| {
-        let downstream = match zone.exit {
-            super::Exit::Out => None,
-            super::Exit::Zone { zone, .. } => {
-                let zone = &topology.zones[zone as usize];
-                let lengths = zone.approaches.iter().map(|a| a.length_m);
-                Some(sections::Downstream { zone: &zone.name, longest_m: lengths.fold(0.0, f64::max) })
-            }
-        };
-        sections::flow(&zone_tables[declared], downstream.as_ref(), &vehicle)
-    });
-    let policies = policies.collect::<Result<Vec<_>, _>>()?;
-    for (zone, flow) in topology.zones.iter_mut().zip(policies) {
-        zone.flow = flow;
-    }
+    flow_policies(&zone_tables, &mut topology, &vehicle)?;
 
-    let mut reader = DemandReader { base, seed, roads: road_names, vehicle, traces: BTreeMap::new() };
+    let routes = road_tables.iter().zip(&topology.road_ends);
+    let routes = routes.map(|(table, &end)| routes::read(table, &topology.zones, end));
+    let routes = routes.collect::<Result<Vec<_>, _>>()?;
+    let mut reader = DemandReader { base, seed, roads: road_names, routes, vehicle, traces: BTreeMap::new() };
     let mut roads = Vec::with_capacity(road_tables.len());
-    for (index, (table, &(zone, path))) in road_tables.iter().zip(&topology.road_ends).enumerate() {
+    for (index, (table, &(zone, segment))) in road_tables.iter().zip(&topology.road_ends).enumerate() {
         let demand = reader.read(index as u32, table)?;
-        roads.push(Road { name: reader.roads[index].to_owned(), zone, path, demand });
+        let name = reader.roads[index].to_owned();
+        let routes = std::mem::take(&mut reader.routes[index]);
+        roads.push(Road { name, zone, segment, demand, routes });
     }
     let plugins = plugins::read(&root, &topology.zones)?;
     let shield = root.choice_or_first(
@@ -224,6 +220,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         max_vehicles,
         max_time_s,
         network,
+        fleet,
         vehicle,
         control,
         beta,
@@ -231,6 +228,32 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         shield,
         faults,
     })
+}
+
+/// The flow policy of each exit: its own, or else its zone's.
+fn flow_policies(
+    tables: &[Table<'_>],
+    topology: &mut topology::Topology,
+    vehicle: &super::VehicleParams,
+) -> Result<(), ScenarioError> {
+    let longest_m: Vec<(String, f64)> =
+        topology.zones.iter().map(|zone| (zone.name.clone(), zone.longest_m())).collect();
+    for (zone, &declared) in topology.zones.iter_mut().zip(&topology.declared) {
+        let table = &tables[declared];
+        let own: Vec<Table<'_>> = match table.get("exits") {
+            Some(_) => table.tables("exits", "a list of exits")?,
+            None => Vec::new(),
+        };
+        for (index, exit) in zone.exits.iter_mut().enumerate() {
+            let downstream = exit.to.map(|to| {
+                let (zone, longest_m) = &longest_m[to.zone as usize];
+                sections::Downstream { zone, longest_m: *longest_m }
+            });
+            let table = own.get(index).filter(|exit| exit.get("flow").is_some()).unwrap_or(table);
+            exit.flow = sections::flow(table, downstream.as_ref(), vehicle)?;
+        }
+    }
+    Ok(())
 }
 
 /// `dt_s` as nanoseconds.

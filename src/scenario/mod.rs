@@ -1,11 +1,13 @@
 //! What is to be simulated: the network, its demand, and the parameters of vehicles and controllers.
 //!
 //! A [`Scenario`] is validated: every value in it is finite and within its stated range, every index
-//! points at something, and the network is acyclic. Nothing downstream checks these again.
+//! points at something, and every zone has a way out of the network. Nothing downstream checks these again.
 
 pub mod arrivals;
 mod check;
+pub mod circles;
 pub mod demand;
+pub(crate) mod draw;
 mod embedded;
 pub mod encode;
 pub mod faults;
@@ -18,6 +20,7 @@ pub mod share;
 
 pub use arrivals::ArrivalStream;
 pub use check::ScenarioFault;
+pub use circles::Circles;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use encode::{DecodeError, decode, encode, keep, kept, scenario_hash};
 pub use faults::{CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall};
@@ -25,10 +28,13 @@ pub use load::{
     DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
     load_recorded, text_of,
 };
-pub use network::{Approach, Exit, Network, Road, Source, Zone, ZoneId};
+pub use network::{
+    Crossing, Downstream, Exit, LawKind, Network, PassingOrder, Path, Road, Route, Segment, Source, Zone,
+    ZoneId,
+};
 pub use params::{
-    Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
-    Segment, Solver, VehicleParams,
+    Baseline, ControlParams, FeConditions, FlowPolicy, Observed, PositionFeedback, ReferenceLaw, Replan,
+    SafetyRows, Solver, VehicleKind, VehicleParams,
 };
 pub use plugins::{ControllerNames, Drivers, Plugin, ShieldMode};
 
@@ -52,6 +58,8 @@ pub struct Scenario {
     pub network: Network,
     /// Vehicle limits and the safety distances.
     pub vehicle: VehicleParams,
+    /// Kinds of vehicles; at least one.
+    pub fleet: Vec<VehicleKind>,
     /// The controllers' law.
     pub control: ControlParams,
     /// Weight of time against energy, m^2/s^4 (paper: beta in `eqn:energyobj`).
@@ -65,6 +73,15 @@ pub struct Scenario {
 }
 
 impl Scenario {
+    /// The kind of a vehicle: index in [`fleet`](Self::fleet). A hash of seed and vehicle, so nothing is remembered.
+    pub fn kind_of(&self, vehicle: u32) -> u16 {
+        if self.fleet.len() == 1 {
+            return 0;
+        }
+        draw::choice(self.seed, u64::from(vehicle), draw::KIND, self.fleet.iter().map(|kind| kind.share))
+            as u16
+    }
+
     /// The step length in seconds.
     pub fn dt_s(&self) -> f64 {
         self.dt_ns as f64 * 1e-9

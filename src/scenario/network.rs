@@ -1,10 +1,11 @@
-//! The network: an acyclic graph of merging zones.
+//! The network: control zones, the exits and links between them, and the entry roads.
 
 use super::demand::Demand;
 use super::params::FlowPolicy;
 use serde::{Deserialize, Serialize};
 
-/// Index of a zone in [`Network::zones`]. Zones are in topological order: upstream first.
+/// Index of a zone in [`Network::zones`]. Zones are sorted upstream first as far as the network has such an
+/// order; a connection to a zone that does not come later closes a cycle.
 pub type ZoneId = u32;
 
 /// All zones and entry roads.
@@ -16,55 +17,120 @@ pub struct Network {
     pub roads: Vec<Road>,
 }
 
-/// One control zone: approaches that end in a common conflict point, and one exit.
+/// One control zone: lanes, the paths vehicles take over them, and where these conflict.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Zone {
     /// Unique name.
     pub name: String,
-    /// Paths into the conflict point, at least one.
-    pub approaches: Vec<Approach>,
-    /// Where the zone's exit leads.
-    pub exit: Exit,
-    /// How the zone's coordinator sets the terminal speed.
-    pub flow: FlowPolicy,
+    /// Stretches of lane.
+    pub segments: Vec<Segment>,
+    /// Movements, each over some segments from an entrance to an exit; at least one.
+    pub paths: Vec<Path>,
+    /// Where paths lead; at least one.
+    pub exits: Vec<Exit>,
+    /// Places where segments cross that no path shares.
+    pub crossings: Vec<Crossing>,
+    /// Who passes a conflict point first.
+    pub order: PassingOrder,
+    /// The law of the zone's built-in controllers.
+    pub law: LawKind,
 }
 
-/// One path through a zone.
+/// A stretch of lane.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Approach {
+pub struct Segment {
     /// Name, unique within the zone.
     pub name: String,
-    /// Distance from the zone's origin on this path to the conflict point, m (paper: L).
+    /// Length, m.
     pub length_m: f64,
-    /// Where its vehicles come from.
-    pub source: Source,
+    /// Where its vehicles come from, if it is an entrance of the zone.
+    pub source: Option<Source>,
+    /// Polyline it is drawn as, m; empty when nobody said.
+    pub shape: Vec<[f64; 2]>,
 }
 
-/// Where the vehicles of an approach come from.
+/// One way through a zone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Path {
+    /// Name, unique within the zone.
+    pub name: String,
+    /// Segments from entrance to exit: indices in [`Zone::segments`].
+    pub segments: Vec<u32>,
+    /// Index in [`Zone::exits`].
+    pub exit: u32,
+    /// Sum of the segments' lengths, m (paper: L).
+    pub length_m: f64,
+    /// Weight with which vehicles of its entrance take it when their route does not say.
+    pub share: f64,
+}
+
+/// Where the vehicles of an entrance come from.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Source {
     /// An entry road: index in [`Network::roads`].
     Road(u32),
-    /// The exit of an upstream zone.
-    Zone(ZoneId),
+    /// An exit of a zone: index in its [`Zone::exits`].
+    Zone {
+        /// The zone upstream.
+        zone: ZoneId,
+        /// Its exit.
+        exit: u32,
+    },
 }
 
-/// Where a zone's exit leads.
+/// A way out of a zone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Exit {
+    /// Name, unique within the zone.
+    pub name: String,
+    /// Where it leads; `None` out of the network.
+    pub to: Option<Downstream>,
+    /// How the zone's coordinator sets the terminal speed of those that leave by it.
+    pub flow: FlowPolicy,
+}
+
+/// Where an exit leads.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Exit {
-    /// Out of the network.
-    Out,
-    /// To an approach of a zone further down, over a plain link of the given length (0: directly).
-    Zone {
-        /// Downstream zone.
-        zone: ZoneId,
-        /// Approach of that zone.
-        path: u32,
-        /// Length of the uncontrolled link in between, m.
-        link_m: f64,
-        /// Speed driven on that link where nobody is in the way, m/s; without meaning when there is none.
-        link_speed_mps: f64,
-    },
+pub struct Downstream {
+    /// The zone.
+    pub zone: ZoneId,
+    /// Its entrance: index in [`Zone::segments`].
+    pub segment: u32,
+    /// Length of the plain link in between, m (0: none).
+    pub link_m: f64,
+    /// Speed driven on that link where nobody is in the way, m/s; without meaning when there is none.
+    pub link_speed_mps: f64,
+}
+
+/// A conflict area between segments that no path shares.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Crossing {
+    /// Name, unique within the zone.
+    pub name: String,
+    /// Extent of the conflict area along a path, m.
+    pub length_m: f64,
+    /// Where it begins on each segment: index in [`Zone::segments`], and distance from its start, m.
+    pub places: Vec<(u32, f64)>,
+}
+
+/// How a coordinator decides who passes a conflict point first.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PassingOrder {
+    /// In order of entry into the zone.
+    #[default]
+    Fifo,
+    /// In order of expected arrival, conflict point by conflict point.
+    PerPoint,
+}
+
+/// A law of the built-in controllers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LawKind {
+    /// Optimal control tracked under control barrier functions, as in the paper.
+    #[default]
+    Ocbf,
 }
 
 /// An entry road.
@@ -74,31 +140,80 @@ pub struct Road {
     pub name: String,
     /// Zone the road leads to.
     pub zone: ZoneId,
-    /// Approach of that zone.
-    pub path: u32,
+    /// Its entrance: index in [`Zone::segments`].
+    pub segment: u32,
     /// Who arrives when.
     pub demand: Demand,
+    /// Ways its vehicles may take, with weights; empty when paths are drawn zone by zone.
+    pub routes: Vec<Route>,
+}
+
+/// The paths a vehicle takes from zone to zone; behind the last one paths are drawn.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Route {
+    /// Name, unique among the road's; arrival traces use it.
+    pub name: String,
+    /// Indices in [`Zone::paths`], one per zone on the way.
+    pub paths: Vec<u32>,
+    /// Weight with which vehicles of the road take it; 0 for routes only a trace names.
+    pub share: f64,
+}
+
+impl Zone {
+    /// The paths that begin at an entrance, by index.
+    pub fn paths_from(&self, segment: u32) -> impl Iterator<Item = u32> + Clone + '_ {
+        (0..).zip(&self.paths).filter(move |(_, path)| path.segments[0] == segment).map(|(index, _)| index)
+    }
+
+    /// The entrance a path begins at.
+    pub fn entrance(&self, path: u32) -> &Segment {
+        &self.segments[self.paths[path as usize].segments[0] as usize]
+    }
+
+    /// The exit a path leads to.
+    pub fn exit_of(&self, path: u32) -> &Exit {
+        &self.exits[self.paths[path as usize].exit as usize]
+    }
+
+    /// Whether lanes, paths, exits and crossings are the same; names of zones, flow policies, orders and laws may
+    /// differ.
+    pub fn same_shape(&self, other: &Zone) -> bool {
+        let leads_alike = |(a, b): (&Exit, &Exit)| a.name == b.name && a.to == b.to;
+        self.segments == other.segments
+            && self.paths == other.paths
+            && self.crossings == other.crossings
+            && self.exits.len() == other.exits.len()
+            && self.exits.iter().zip(&other.exits).all(leads_alike)
+    }
+
+    /// Length of the longest path, m.
+    pub fn longest_m(&self) -> f64 {
+        self.paths.iter().map(|path| path.length_m).fold(0.0, f64::max)
+    }
 }
 
 impl Network {
-    /// The downstream neighbour of a zone, if its exit leads to one.
-    pub fn downstream(&self, zone: ZoneId) -> Option<ZoneId> {
-        match self.zones[zone as usize].exit {
-            Exit::Out => None,
-            Exit::Zone { zone, .. } => Some(zone),
-        }
+    /// The zones downstream of a zone, in order of exit; one that two exits lead to twice.
+    pub fn downstream(&self, zone: ZoneId) -> impl Iterator<Item = ZoneId> + '_ {
+        self.zones[zone as usize].exits.iter().filter_map(|exit| Some(exit.to?.zone))
     }
 
-    /// The upstream neighbours of a zone, in order of approach.
+    /// The zones upstream of a zone, in order of entrance.
     pub fn upstream(&self, zone: ZoneId) -> impl Iterator<Item = ZoneId> + '_ {
-        self.zones[zone as usize].approaches.iter().filter_map(|a| match a.source {
-            Source::Zone(z) => Some(z),
-            Source::Road(_) => None,
+        self.zones[zone as usize].segments.iter().filter_map(|segment| match segment.source {
+            Some(Source::Zone { zone, .. }) => Some(zone),
+            _ => None,
         })
     }
 
-    /// All neighbours of a zone: upstream ones, then the downstream one.
-    pub fn neighbours(&self, zone: ZoneId) -> impl Iterator<Item = ZoneId> + '_ {
-        self.upstream(zone).chain(self.downstream(zone))
+    /// All neighbours of a zone, each once: upstream ones, then downstream ones.
+    pub fn neighbours(&self, zone: ZoneId) -> impl Iterator<Item = ZoneId> {
+        let mut all: Vec<ZoneId> = Vec::new();
+        for neighbour in self.upstream(zone).chain(self.downstream(zone)) {
+            if neighbour != zone && !all.contains(&neighbour) {
+                all.push(neighbour);
+            }
+        }
+        all.into_iter()
     }
 }

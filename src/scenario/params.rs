@@ -21,6 +21,17 @@ pub struct VehicleParams {
     pub standstill_gap_m: f64,
 }
 
+/// A kind of vehicle.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct VehicleKind {
+    /// Unique name.
+    pub name: String,
+    /// Weight with which vehicles are of this kind.
+    pub share: f64,
+    /// Limits, length and distances.
+    pub vehicle: VehicleParams,
+}
+
 /// Which necessary condition the reference trajectory satisfies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -127,7 +138,7 @@ pub enum Baseline {
 
 /// Which part of the downstream zone a policy observes.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Segment {
+pub enum Observed {
     /// The whole zone: N.
     Whole,
     /// Its first metres: N(l).
@@ -151,7 +162,7 @@ pub enum FlowPolicy {
         /// Gain k, m/s per vehicle.
         gain_mps: f64,
         /// Where vehicles are counted.
-        segment: Segment,
+        segment: Observed,
         /// v_m is not set lower, m/s.
         min_mps: f64,
     },

@@ -1,4 +1,4 @@
-//! Which controller drives which approaches, and what the gateway does with its commands.
+//! Which controller drives which paths, and what the gateway does with its commands.
 
 use super::{Scenario, ZoneId};
 use serde::{Deserialize, Serialize};
@@ -9,8 +9,8 @@ use std::ops::Range;
 pub struct Plugin {
     /// Unique name; the process gives it when it attaches.
     pub name: String,
-    /// The approaches it drives: zone and path, ascending.
-    pub approaches: Vec<(ZoneId, u32)>,
+    /// The paths it drives: zone and path, ascending.
+    pub paths: Vec<(ZoneId, u32)>,
     /// Command line with which `cz run` starts it; absent when somebody else does.
     pub command: Option<String>,
 }
@@ -47,7 +47,7 @@ impl ShieldMode {
     }
 }
 
-/// Which controller process drives which approach: the built-in pool's processes come first, then the
+/// Which controller process drives which path: the built-in pool's processes come first, then the
 /// plug-ins in order of declaration.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Drivers {
@@ -55,7 +55,7 @@ pub struct Drivers {
     plugins: u32,
     /// Controller index by zone and path.
     of: Vec<Vec<u32>>,
-    /// By zone, the controller of all its approaches, if it is one.
+    /// By zone, the controller of all its paths, if it is one.
     of_zone: Vec<Option<u32>>,
     /// By controller, the zones outside which it drives nothing.
     zones: Vec<Range<ZoneId>>,
@@ -71,30 +71,30 @@ impl Drivers {
         let pool = controllers.checked_sub(plugins).expect("every plug-in is a controller process");
         let count = scenario.network.zones.len() as u32;
         let mut of: Vec<Vec<u32>> =
-            scenario.network.zones.iter().map(|z| vec![u32::MAX; z.approaches.len()]).collect();
+            scenario.network.zones.iter().map(|z| vec![u32::MAX; z.paths.len()]).collect();
         let mut zones: Vec<Range<ZoneId>> =
             (0..pool).map(|index| super::share::zones_of(count, index, pool)).collect();
         for (index, range) in (0..).zip(&zones) {
             range.clone().for_each(|zone| of[zone as usize].fill(index));
         }
         for (plugin, index) in scenario.plugins.iter().zip(pool..) {
-            for &(zone, path) in &plugin.approaches {
+            for &(zone, path) in &plugin.paths {
                 of[zone as usize][path as usize] = index;
             }
-            let first = plugin.approaches.iter().map(|&(zone, _)| zone).min();
-            let last = plugin.approaches.iter().map(|&(zone, _)| zone).max();
+            let first = plugin.paths.iter().map(|&(zone, _)| zone).min();
+            let last = plugin.paths.iter().map(|&(zone, _)| zone).max();
             zones.push(first.zip(last).map_or(0..0, |(first, last)| first..last + 1));
         }
         let of_zone = of.iter().map(|of| of.iter().all(|&o| o == of[0]).then(|| of[0])).collect();
         Drivers { pool, plugins, of, of_zone, zones }
     }
 
-    /// The controller that drives an approach.
+    /// The controller that drives a path.
     pub fn of(&self, zone: ZoneId, path: u32) -> u32 {
         self.of[zone as usize][path as usize]
     }
 
-    /// The controller that drives all approaches of a zone, if it is one.
+    /// The controller that drives all paths of a zone, if it is one.
     pub fn of_zone(&self, zone: ZoneId) -> Option<u32> {
         self.of_zone[zone as usize]
     }
@@ -138,17 +138,17 @@ impl ControllerNames {
 }
 
 impl Scenario {
-    /// Whether an approach is driven by a plug-in.
+    /// Whether a path is driven by a plug-in.
     pub fn is_plugged(&self, zone: ZoneId, path: u32) -> bool {
-        self.plugins.iter().any(|p| p.approaches.contains(&(zone, path)))
+        self.plugins.iter().any(|p| p.paths.contains(&(zone, path)))
     }
 
     /// Number of controller processes of a run whose built-in pool may have `pool` of them: none when
-    /// plug-ins drive every approach.
+    /// plug-ins drive every path.
     pub fn controllers(&self, pool: u32) -> u32 {
-        let approaches: usize = self.network.zones.iter().map(|z| z.approaches.len()).sum();
-        let plugged: usize = self.plugins.iter().map(|p| p.approaches.len()).sum();
-        let pool = if plugged == approaches { 0 } else { pool };
+        let paths: usize = self.network.zones.iter().map(|z| z.paths.len()).sum();
+        let plugged: usize = self.plugins.iter().map(|p| p.paths.len()).sum();
+        let pool = if plugged == paths { 0 } else { pool };
         pool + self.plugins.len() as u32
     }
 

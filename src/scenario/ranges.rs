@@ -43,6 +43,12 @@ pub(super) const GAIN: Range = range("a gain", 1e-6, 1e6, "1/s");
 pub(super) const SLACK_WEIGHT: Range = Range { zero: true, ..range("a weight", 1e-6, 1e6, "m^2/s^4") };
 /// `zones.approaches.length_m`. A frame has room for the vehicles that fit.
 pub(super) const APPROACH_LENGTH: Range = range("a length", 1.0, 1e6, "m");
+/// `zones.segments.length_m`; a path as a whole has at least [`APPROACH_LENGTH`].
+pub(super) const SEGMENT_LENGTH: Range = range("a length", 0.01, 1e6, "m");
+/// `zones.crossings.length_m`.
+pub(super) const CROSSING_LENGTH: Range = range("a length", 0.1, 1000.0, "m");
+/// `share` of paths, routes and kinds of vehicles.
+pub(super) const SHARE: Range = Range { zero: true, ..range("a weight", 1e-6, 1e6, "") };
 /// `zones.approaches.link_m`.
 pub(super) const LINK_LENGTH: Range = Range { zero: true, ..range("a length", 1.0, 1e6, "m") };
 /// `zones.approaches.link_speed_mps`, which does not exceed `v_max_mps` either.

@@ -7,29 +7,36 @@
 //! under `u_min`, and in both the set of admissible accelerations of a step is an interval that begins at
 //! `u_min`. So the projection always exists, and it is one number. The derivation is in `docs/shield.md`.
 
+use crate::conflict::{Conflicts, Duties, DutyKind, Row as Vehicle};
 use crate::scenario::VehicleParams;
 use crate::vehicle::Held;
-
-/// What a partner is to the vehicle.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Duty {
-    /// The partner drives ahead on the same path: the margin is kept at every instant.
-    RearEnd,
-    /// The partner passes the conflict point at this distance (m, on the vehicle's path) first: the margin
-    /// is kept from the instant at which the vehicle passes it.
-    Merge {
-        /// Position of the conflict point on the vehicle's path, m.
-        conflict_m: f64,
-    },
-}
 
 /// A partner and its motion over the coming step, in the vehicle's coordinate.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Partner {
     /// What is owed to it.
-    pub duty: Duty,
+    pub kind: DutyKind,
+    /// Place of the conflict point on the vehicle's path, m; means nothing toward a leader.
+    pub at_m: f64,
+    /// Distance delta to be kept, m.
+    pub gap_m: f64,
+    /// Its strongest braking as a positive number, m/s^2.
+    pub braking_mps2: f64,
     /// Its motion over the step, already shielded.
     pub motion: Held,
+}
+
+/// The other vehicle at one instant, in the vehicle's coordinate.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Seen {
+    /// Position, m.
+    pub x_m: f64,
+    /// Speed, m/s.
+    pub v_mps: f64,
+    /// Distance delta to be kept to it, m.
+    pub gap_m: f64,
+    /// Its strongest braking as a positive number, m/s^2.
+    pub braking_mps2: f64,
 }
 
 /// What bounded a projected command.
@@ -41,6 +48,8 @@ pub enum Row {
     RearEnd,
     /// The merging margin.
     Merge,
+    /// The crossing margin.
+    Cross,
 }
 
 /// A command after the shield.
@@ -69,7 +78,6 @@ pub struct Shield {
     braking_mps2: f64,
     v_max_mps: f64,
     reaction_s: f64,
-    gap_m: f64,
     dt_s: f64,
 }
 
@@ -80,97 +88,119 @@ impl Shield {
             braking_mps2: -vehicle.u_min_mps2,
             v_max_mps: vehicle.v_max_mps,
             reaction_s: vehicle.reaction_time_s,
-            gap_m: vehicle.standstill_gap_m,
             dt_s,
         }
     }
 
     /// How far the state is inside the set that is safe toward a leader, m; negative outside.
     ///
-    /// The least margin while both brake at `u_min` to a stop. In closed form: the lesser of the margin
-    /// now, and of the leader's stopping point less the farthest that `x + phi v` gets while braking.
-    pub fn slack_m(&self, x_m: f64, v_mps: f64, leader_x_m: f64, leader_v_mps: f64) -> f64 {
+    /// The least margin while both brake fully to a stop. For equal braking in closed form: the lesser of the
+    /// margin now, and of the leader's stopping point less the farthest that `x + phi v` gets while braking.
+    pub fn slack_m(&self, x_m: f64, v_mps: f64, leader: Seen) -> f64 {
         let b = self.braking_mps2;
-        let lead = leader_x_m - x_m - self.gap_m;
+        if leader.braking_mps2 != b {
+            let own = Held::new(x_m, v_mps, -b);
+            let other = Held::new(leader.x_m, leader.v_mps, -leader.braking_mps2);
+            let both_stand_s = (v_mps / b).max(leader.v_mps / leader.braking_mps2);
+            return own.least_margin_m(&other, 0.0, self.reaction_s, leader.gap_m, both_stand_s);
+        }
+        let lead = leader.x_m - x_m - leader.gap_m;
         let now = lead - self.reaction_s * v_mps;
         let shed = (v_mps - self.reaction_s * b).max(0.0);
         // Only while the vehicle is faster than the leader by more than it sheds in a reaction time does
         // the margin shrink, until both have stopped shrinking it.
-        now.min(now + (leader_v_mps * leader_v_mps - shed * shed) / (2.0 * b))
+        now.min(now + (leader.v_mps * leader.v_mps - shed * shed) / (2.0 * b))
     }
 
     /// How far the state is inside the set that is safe toward a merging partner, m; negative outside.
     ///
-    /// Both brake at `u_min`. Either the vehicle stops before the conflict point, or it is safe toward the
-    /// partner, as toward a leader, when it gets there.
-    pub fn merge_slack_m(&self, x_m: f64, v_mps: f64, other_x_m: f64, other_v_mps: f64, at_m: f64) -> f64 {
+    /// Both brake fully. Either the vehicle stops before the conflict point, or it is safe toward the partner, as
+    /// toward a leader, when it gets there.
+    pub fn merge_slack_m(&self, x_m: f64, v_mps: f64, other: Seen, at_m: f64) -> f64 {
         if x_m >= at_m {
-            return self.slack_m(x_m, v_mps, other_x_m, other_v_mps);
+            return self.slack_m(x_m, v_mps, other);
         }
+        let (stopping, crossing_mps, then) = self.brake_to(x_m, v_mps, other, at_m);
+        stopping.max(self.slack_m(at_m, crossing_mps, then))
+    }
+
+    /// How far the state is inside the set that is safe toward a crossing partner, m; negative outside, infinite
+    /// once the vehicle has reached the crossing.
+    ///
+    /// Both brake fully. Either the vehicle stops before the conflict area, or the partner is `phi v + delta`
+    /// behind its beginning when the vehicle gets there.
+    pub fn cross_slack_m(&self, x_m: f64, v_mps: f64, other: Seen, at_m: f64) -> f64 {
+        if x_m >= at_m {
+            return f64::INFINITY;
+        }
+        let (stopping, crossing_mps, then) = self.brake_to(x_m, v_mps, other, at_m);
+        stopping.max(then.x_m - at_m - self.reaction_s * crossing_mps - other.gap_m)
+    }
+
+    /// Both brake fully: by how much the vehicle stops before `at_m` (negative: it does not), the speed with which it
+    /// gets there otherwise, and the other vehicle at that instant.
+    fn brake_to(&self, x_m: f64, v_mps: f64, other: Seen, at_m: f64) -> (f64, f64, Seen) {
         let b = self.braking_mps2;
         let stopping = at_m - x_m - v_mps * v_mps / (2.0 * b);
         // Below the least crossing speed the square root would magnify rounding; taking it greater than
         // it is errs on the safe side.
         let crossing_mps = (-2.0 * b * stopping).max(LEAST_CROSSING_MPS * LEAST_CROSSING_MPS).sqrt();
         let after_s = ((v_mps - crossing_mps) / b).max(0.0);
-        let other = Held::new(other_x_m, other_v_mps, -b);
-        let crossing = self.slack_m(at_m, crossing_mps, other.position_m(after_s), other.speed_mps(after_s));
-        stopping.max(crossing)
+        let braking = Held::new(other.x_m, other.v_mps, -other.braking_mps2);
+        let then = Seen { x_m: braking.position_m(after_s), v_mps: braking.speed_mps(after_s), ..other };
+        (stopping, crossing_mps, then)
     }
 
     /// How far a state is inside the safe set toward a partner at the beginning of its motion, m.
     pub fn state_slack_m(&self, x_m: f64, v_mps: f64, partner: &Partner) -> f64 {
-        let Held { x0_m, v0_mps, .. } = partner.motion;
-        self.slack_of(partner.duty, x_m, v_mps, x0_m, v0_mps)
+        self.slack_of(x_m, v_mps, partner, 0.0)
     }
 
     /// The slack at the end of a step driven with `own`, m.
     pub fn slack_after_m(&self, own: &Held, partner: &Partner) -> f64 {
-        let (x, v) = (own.position_m(self.dt_s), own.speed_mps(self.dt_s));
-        let other = &partner.motion;
-        self.slack_of(partner.duty, x, v, other.position_m(self.dt_s), other.speed_mps(self.dt_s))
+        self.slack_of(own.position_m(self.dt_s), own.speed_mps(self.dt_s), partner, self.dt_s)
     }
 
-    fn slack_of(&self, duty: Duty, x_m: f64, v_mps: f64, other_x_m: f64, other_v_mps: f64) -> f64 {
-        match duty {
-            Duty::RearEnd => self.slack_m(x_m, v_mps, other_x_m, other_v_mps),
-            Duty::Merge { conflict_m } => self.merge_slack_m(x_m, v_mps, other_x_m, other_v_mps, conflict_m),
+    fn slack_of(&self, x_m: f64, v_mps: f64, partner: &Partner, after_s: f64) -> f64 {
+        let Partner { kind, at_m, gap_m, braking_mps2, motion } = partner;
+        let other = Seen {
+            x_m: motion.position_m(after_s),
+            v_mps: motion.speed_mps(after_s),
+            gap_m: *gap_m,
+            braking_mps2: *braking_mps2,
+        };
+        match kind {
+            DutyKind::RearEnd => self.slack_m(x_m, v_mps, other),
+            DutyKind::Merge => self.merge_slack_m(x_m, v_mps, other, *at_m),
+            DutyKind::Cross => self.cross_slack_m(x_m, v_mps, other, *at_m),
         }
     }
 
-    /// The least margin that counts during the step, m: toward a leader that of every instant, toward a
-    /// merging partner that from the crossing on; infinite when there is no crossing in the step.
+    /// The least margin that counts during the step, m: toward a leader that of every instant, toward a merging
+    /// partner that from the merge on, toward a crossing one that at the crossing; infinite when the vehicle
+    /// does not get there in the step.
     pub fn least_margin_m(&self, own: &Held, partner: &Partner) -> f64 {
-        match partner.duty {
-            Duty::RearEnd => own.least_margin_m(&partner.motion, 0.0, self.reaction_s, self.gap_m, self.dt_s),
-            Duty::Merge { conflict_m } => match own.passes_m(conflict_m, self.dt_s) {
-                None => f64::INFINITY,
-                Some(after_s) => {
-                    let later = |held: &Held| {
-                        Held::new(held.position_m(after_s), held.speed_mps(after_s), held.u_mps2)
-                    };
-                    let rest_s = self.dt_s - after_s;
-                    later(own).least_margin_m(
-                        &later(&partner.motion),
-                        0.0,
-                        self.reaction_s,
-                        self.gap_m,
-                        rest_s,
-                    )
-                }
-            },
+        let Partner { kind, at_m, gap_m, motion, .. } = partner;
+        if *kind == DutyKind::RearEnd {
+            return own.least_margin_m(motion, 0.0, self.reaction_s, *gap_m, self.dt_s);
         }
+        let Some(after_s) = own.passes_m(*at_m, self.dt_s) else { return f64::INFINITY };
+        if *kind == DutyKind::Cross {
+            return motion.position_m(after_s) - at_m - self.reaction_s * own.speed_mps(after_s) - gap_m;
+        }
+        let later = |held: &Held| Held::new(held.position_m(after_s), held.speed_mps(after_s), held.u_mps2);
+        later(own).least_margin_m(&later(motion), 0.0, self.reaction_s, *gap_m, self.dt_s - after_s)
     }
 
     /// Whether the step may be driven so: its end is safe, and the margin has not been negative, nor less
     /// than it was to begin with, in between.
     fn admits(&self, own: &Held, partner: &Partner) -> bool {
-        let floor = match partner.duty {
-            Duty::RearEnd => {
+        let floor = match partner.kind {
+            DutyKind::RearEnd => {
                 let leader = &partner.motion;
-                leader.x0_m - own.x0_m - self.reaction_s * own.v0_mps - self.gap_m
+                leader.x0_m - own.x0_m - self.reaction_s * own.v0_mps - partner.gap_m
             }
-            Duty::Merge { .. } => RESERVE_M,
+            DutyKind::Merge | DutyKind::Cross => RESERVE_M,
         };
         self.slack_after_m(own, partner) >= RESERVE_M
             && self.least_margin_m(own, partner) >= floor.min(RESERVE_M)
@@ -208,12 +238,40 @@ impl Shield {
                 }
             }
             if low < best.u_mps2 {
-                let row = if partner.duty == Duty::RearEnd { Row::RearEnd } else { Row::Merge };
+                let row = match partner.kind {
+                    DutyKind::RearEnd => Row::RearEnd,
+                    DutyKind::Merge => Row::Merge,
+                    DutyKind::Cross => Row::Cross,
+                };
                 best = Projection { u_mps2: low, row: Some(row) };
             }
         }
         best
     }
+}
+
+/// Whether a vehicle may be told to let another pass first: by how much it is inside the safe sets of all it then owes
+/// to it, m; infinite when the two do not meet.
+pub fn yielding_slack_m(
+    shield: &Shield,
+    conflicts: &Conflicts,
+    duties: &mut Duties,
+    first: &Vehicle,
+    second: &Vehicle,
+) -> f64 {
+    duties.derive(conflicts, &[*first, *second]);
+    let slack = |duty: &crate::conflict::Duty| {
+        let Some(kind) = duty.in_force(second.x_m, first.x_m) else { return f64::INFINITY };
+        let partner = Partner {
+            kind,
+            at_m: duty.own_m,
+            gap_m: duty.gap_m,
+            braking_mps2: first.braking_mps2,
+            motion: Held::new(first.x_m + duty.shift_m(), first.v_mps, 0.0),
+        };
+        shield.state_slack_m(second.x_m, second.v_mps, &partner)
+    };
+    duties.of(1).iter().map(slack).fold(f64::INFINITY, f64::min)
 }
 
 #[cfg(test)]

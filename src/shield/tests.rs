@@ -17,14 +17,19 @@ fn margin(own: &Held, leader: &Held, t: f64) -> f64 {
     leader.position_m(t) - own.position_m(t) - 1.8 * own.speed_mps(t) - 0.5
 }
 
-/// A duty, a state (x, v) at most 80 m before a conflict point at 200 m, and a partner ahead.
-fn scenes() -> impl Strategy<Value = (bool, f64, f64, f64, f64, f64)> {
-    (any::<bool>(), 120.0..200.0f64, 0.0..30.0f64, -5.0..70.0f64, 0.0..30.0f64, -4.0..4.0f64)
+/// Any duty, toward a partner that may brake as hard as the vehicle, less, or harder.
+fn owed() -> impl Strategy<Value = (DutyKind, f64)> {
+    let kind = prop_oneof![Just(DutyKind::RearEnd), Just(DutyKind::Merge), Just(DutyKind::Cross)];
+    (kind, prop_oneof![Just(4.0), 2.0..8.0f64])
 }
 
-fn partner(merge: bool, x: f64, v: f64, u: f64) -> Partner {
-    let duty = if merge { Duty::Merge { conflict_m: 200.0 } } else { Duty::RearEnd };
-    Partner { duty, motion: Held::new(x, v, u) }
+/// A duty, a state (x, v) at most 80 m before a conflict point at 200 m, and a partner ahead.
+fn scenes() -> impl Strategy<Value = ((DutyKind, f64), f64, f64, f64, f64, f64)> {
+    (owed(), 120.0..200.0f64, 0.0..30.0f64, -5.0..70.0f64, 0.0..30.0f64, -4.0..4.0f64)
+}
+
+fn partner((kind, braking_mps2): (DutyKind, f64), x: f64, v: f64, u: f64) -> Partner {
+    Partner { kind, at_m: 200.0, gap_m: 0.5, braking_mps2, motion: Held::new(x, v, u.max(-braking_mps2)) }
 }
 
 proptest! {
@@ -34,20 +39,22 @@ proptest! {
     #[test]
     fn slack_is_the_least_margin_of_both_braking(
         v in 0.0..30.0f64, lead in -10.0..100.0f64, w in 0.0..30.0f64,
+        braking_mps2 in prop_oneof![Just(4.0), 2.0..8.0f64],
     ) {
         let shield = Shield::new(&VEHICLE, 0.1);
-        let (own, leader) = (Held::new(0.0, v, -4.0), Held::new(lead, w, -4.0));
-        let exact = own.least_margin_m(&leader, 0.0, 1.8, 0.5, 8.0);
-        prop_assert!((shield.slack_m(0.0, v, lead, w) - exact).abs() < 1e-9);
+        let (own, leader) = (Held::new(0.0, v, -4.0), Held::new(lead, w, -braking_mps2));
+        let exact = own.least_margin_m(&leader, 0.0, 1.8, 0.5, 16.0);
+        let seen = Seen { x_m: lead, v_mps: w, gap_m: 0.5, braking_mps2 };
+        prop_assert!((shield.slack_m(0.0, v, seen) - exact).abs() < 1e-9);
     }
 
     /// From a safe state, u_min ends in a safe state whatever the partner does.
     #[test]
     fn safe_sets_are_invariant_under_full_braking(
-        (merge, x, v, ahead, w, u) in scenes(), dt in 0.01..2.0f64,
+        (owed, x, v, ahead, w, u) in scenes(), dt in 0.01..2.0f64,
     ) {
         let shield = Shield::new(&VEHICLE, dt);
-        let partner = partner(merge, x + ahead, w, u);
+        let partner = partner(owed, x + ahead, w, u);
         let before = shield.state_slack_m(x, v, &partner);
         prop_assume!(before >= 0.0);
         let own = Held::new(x, v, -4.0);
@@ -58,10 +65,10 @@ proptest! {
     /// Less acceleration is never less safe: what makes the projection one number.
     #[test]
     fn admissible_accelerations_are_an_interval(
-        (merge, x, v, ahead, w, u) in scenes(), dt in 0.01..1.0f64, a in -4.0..4.0f64, b in -4.0..4.0f64,
+        (owed, x, v, ahead, w, u) in scenes(), dt in 0.01..1.0f64, a in -4.0..4.0f64, b in -4.0..4.0f64,
     ) {
         let shield = Shield::new(&VEHICLE, dt);
-        let partner = partner(merge, x + ahead, w, u);
+        let partner = partner(owed, x + ahead, w, u);
         let admits = |u: f64| shield.admits(&Held::new(x, v, u), &partner);
         prop_assert!(admits(a.min(b)) || !admits(a.max(b)));
     }
@@ -70,18 +77,27 @@ proptest! {
     /// not have been admissible.
     #[test]
     fn projection_is_safe_and_no_lower_than_needed(
-        (merge, x, v, ahead, w, u) in scenes(), dt in 0.01..1.0f64, wish in -4.0..4.0f64,
+        (owed, x, v, ahead, w, u) in scenes(), dt in 0.01..1.0f64, wish in -4.0..4.0f64,
     ) {
         let shield = Shield::new(&VEHICLE, dt);
-        let partner = partner(merge, x + ahead, w, u);
+        let partner = partner(owed, x + ahead, w, u);
         prop_assume!(shield.state_slack_m(x, v, &partner) >= 2.0 * RESERVE_M);
         let found = shield.project(x, v, wish, std::iter::once(partner));
         let own = Held::new(x, v, found.u_mps2);
         prop_assert!(found.u_mps2 >= -4.0 && found.u_mps2 <= wish);
         prop_assert!(shield.slack_after_m(&own, &partner) >= 0.0);
+        // A leader at every instant, a merging partner from the merge on, a crossing one at the crossing alone.
+        if let (DutyKind::Cross, Some(t)) = (owed.0, own.passes_m(200.0, dt)) {
+            prop_assert!(margin(&own, &partner.motion, t) >= -1e-11, "at {t}");
+        }
         for i in 0..=500 {
             let t = dt * f64::from(i) / 500.0;
-            if !merge || own.position_m(t) >= 200.0 {
+            let counts = match owed.0 {
+                DutyKind::RearEnd => true,
+                DutyKind::Merge => own.position_m(t) >= 200.0,
+                DutyKind::Cross => false,
+            };
+            if counts {
                 prop_assert!(margin(&own, &partner.motion, t) >= -1e-11, "at {t}");
             }
         }
@@ -95,20 +111,20 @@ proptest! {
     /// A vehicle that obeys the shield stays safe for good, under whatever two controllers wish.
     #[test]
     fn a_shielded_vehicle_stays_safe(
-        (merge, x, v, ahead, w, _) in scenes(),
+        (owed, x, v, ahead, w, _) in scenes(),
         wishes in prop::collection::vec((-4.0..4.0f64, -4.0..4.0f64), 1..200),
     ) {
         let dt = 0.1;
         let shield = Shield::new(&VEHICLE, dt);
-        prop_assume!(shield.state_slack_m(x, v, &partner(merge, x + ahead, w, 0.0)) >= RESERVE_M);
+        prop_assume!(shield.state_slack_m(x, v, &partner(owed, x + ahead, w, 0.0)) >= RESERVE_M);
         let (mut x, mut v, mut y, mut w) = (x, v, x + ahead, w);
         for (wish, lead) in wishes {
-            let partner = partner(merge, y, w, if w >= 30.0 { lead.min(0.0) } else { lead });
+            let partner = partner(owed, y, w, if w >= 30.0 { lead.min(0.0) } else { lead });
             let found = shield.project(x, v, wish, std::iter::once(partner));
             let own = Held::new(x, v, found.u_mps2);
             prop_assert!(shield.least_margin_m(&own, &partner) >= 0.0);
             prop_assert!(shield.slack_after_m(&own, &partner) >= 0.0);
-            if merge && own.position_m(dt) >= 200.0 {
+            if owed.0 != DutyKind::RearEnd && own.position_m(dt) >= 200.0 {
                 break;
             }
             (x, v) = (own.position_m(dt), own.speed_mps(dt));
@@ -129,7 +145,7 @@ fn the_greatest_speed_is_kept() {
 #[test]
 fn a_vehicle_waits_before_the_conflict_point_and_goes_when_its_partner_has_gone() {
     let shield = Shield::new(&VEHICLE, 0.1);
-    let standing = partner(true, 150.0, 0.0, 0.0);
+    let standing = partner((DutyKind::Merge, 4.0), 150.0, 0.0, 0.0);
     let (mut x, mut v) = (100.0, 20.0);
     for _ in 0..600 {
         let u = shield.project(x, v, 4.0, std::iter::once(standing)).u_mps2;
@@ -137,6 +153,6 @@ fn a_vehicle_waits_before_the_conflict_point_and_goes_when_its_partner_has_gone(
         (x, v) = (own.position_m(0.1), own.speed_mps(0.1));
     }
     assert!(x < 200.0 && x > 199.9, "{x}");
-    let gone = partner(true, 240.0, 10.0, 0.0);
+    let gone = partner((DutyKind::Merge, 4.0), 240.0, 10.0, 0.0);
     assert_eq!(shield.project(x, v, 4.0, std::iter::once(gone)).row, None);
 }

@@ -67,6 +67,11 @@ impl RearEnd {
         p.partner_v_mps - p.v_mps - self.reaction_s * self.u_min_mps2
     }
 
+    /// Whether the conditions for leaving FE mode hold (section "Feasibility Enforcement Mode").
+    pub fn may_be_tracked(&self, p: &Pair) -> bool {
+        self.margin_m(p) >= 0.0 && satisfiable_at(&self.row(p), self.u_min_mps2) && self.reserve_mps(p) >= 0.0
+    }
+
     /// `u <= u_p + k1 (v_p - v - phi u_min)` (`equ:candidate`).
     pub fn feasibility_row(&self, p: &Pair) -> Inequality {
         Inequality { coefficient: 1.0, bound: p.partner_u_mps2 + self.k_per_s * self.reserve_mps(p) }
@@ -108,6 +113,11 @@ impl Merge {
     /// `v_c - v - (phi/L) v^2 - (phi/L) x u_min`, which the feasibility row keeps non-negative, m/s.
     pub fn reserve_mps(&self, p: &Pair) -> f64 {
         self.drift_mps(p) - self.reaction_per_length * p.x_m * self.u_min_mps2
+    }
+
+    /// Whether the conditions for leaving FE mode hold (section "Feasibility Enforcement Mode").
+    pub fn may_be_tracked(&self, p: &Pair) -> bool {
+        self.margin_m(p) >= 0.0 && satisfiable_at(&self.row(p), self.u_min_mps2) && self.reserve_mps(p) >= 0.0
     }
 
     /// `(1 + 2 (phi/L) v) u <= u_c - (phi/L) v u_min + k2 (reserve)` (`equ:candidate2`).

@@ -1,14 +1,33 @@
 //! A vehicle as the world keeps it while it is in a zone or on a link.
 
+use super::way::Way;
 use crate::vehicle::Held;
-use ipc_schemas::{NO_VEHICLE, VERDICT_NOMINAL};
+use ipc_schemas::VERDICT_NOMINAL;
 
 /// One vehicle in one place.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Car {
     pub vehicle: u32,
-    /// Approach within the zone.
+    /// Path within the zone.
     pub path: u32,
+    /// The next zone, `u32::MAX` when it leaves the network.
+    pub next_zone: u32,
+    /// Path within the next zone, `u32::MAX` when it leaves the network; and in the one after that.
+    pub next_path: u32,
+    pub then_path: u32,
+    /// Index of the road's route, `u32::MAX` when its paths are drawn.
+    pub route: u32,
+    /// Road it came by.
+    pub road: u32,
+    /// Zones passed before this one.
+    pub hop: u16,
+    /// Kind of vehicle: index in the scenario's fleet.
+    pub kind: u16,
+    /// Of a vehicle that has left the zone: the last zone and exit by which it is known to have left since, and
+    /// the exit it will leave the next one by.
+    pub beyond: Beyond,
+    /// Where its duties are among its zone's.
+    pub owed: (u32, u32),
     /// Distance since the zone's (or link's) origin, m.
     pub x_m: f64,
     pub v_mps: f64,
@@ -25,15 +44,23 @@ pub(super) struct Car {
     pub visit: Visit,
 }
 
+/// How far a vehicle that has left a zone is known to have come.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Beyond {
+    pub zone: u32,
+    pub exit: u32,
+    /// The exit of the zone behind that one, once it has been seen there.
+    pub next_exit: u32,
+}
+
 /// What is accounted while a vehicle is in a zone.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Visit {
     pub energy: f64,
     pub fe_s: f64,
     pub least_rear_end_m: f64,
-    /// What the shield holds the vehicle to.
-    pub rear_end: Guard,
-    pub merge: Guard,
+    pub least_merge_m: f64,
+    pub least_cross_m: f64,
     /// Verdict of the command in force, a `frames::VERDICT_*`.
     pub verdict: u16,
     /// Entered during the step just ended.
@@ -46,25 +73,13 @@ pub(super) struct Visit {
     pub clean_merge: bool,
 }
 
-/// Whether a vehicle was safe toward a partner when it came to owe it something.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Guard {
-    /// `NO_VEHICLE` before the first.
-    pub partner: u32,
-    pub safe: bool,
-}
-
-impl Guard {
-    const NONE: Guard = Guard { partner: NO_VEHICLE, safe: false };
-}
-
 impl Visit {
     pub(super) const NEW: Visit = Visit {
         energy: 0.0,
         fe_s: 0.0,
         least_rear_end_m: f64::INFINITY,
-        rear_end: Guard::NONE,
-        merge: Guard::NONE,
+        least_merge_m: f64::INFINITY,
+        least_cross_m: f64::INFINITY,
         entered: true,
         verdict: VERDICT_NOMINAL,
         infeasible: false,
@@ -75,12 +90,26 @@ impl Visit {
 }
 
 impl Car {
-    /// A vehicle that passed a zone's (or link's) origin at `entry_time_s` with `entry_speed_mps`, and is
-    /// at `x_m` with `v_mps` at the end of the step.
-    pub(super) fn entering(vehicle: u32, path: u32, entry_time_s: f64, entry_speed_mps: f64) -> Car {
+    /// A vehicle that passed its first zone's origin at `entry_time_s` with `entry_speed_mps`.
+    pub(super) fn arriving(
+        vehicle: u32,
+        way: Way,
+        kind: u16,
+        entry_time_s: f64,
+        entry_speed_mps: f64,
+    ) -> Car {
         Car {
             vehicle,
-            path,
+            path: way.path,
+            next_zone: way.next_zone,
+            next_path: way.next_path,
+            then_path: way.then_path,
+            route: way.route,
+            road: way.road,
+            hop: way.hop,
+            kind,
+            beyond: Beyond::default(),
+            owed: (0, 0),
             x_m: 0.0,
             v_mps: entry_speed_mps,
             u_mps2: 0.0,
@@ -91,6 +120,36 @@ impl Car {
             planned_exit_speed_mps: 0.0,
             visit: Visit::NEW,
         }
+    }
+
+    /// The same vehicle when it has passed the next origin, of a zone or a link.
+    pub(super) fn passing(&self, entry_time_s: f64, entry_speed_mps: f64) -> Car {
+        Car {
+            x_m: 0.0,
+            v_mps: entry_speed_mps,
+            u_mps2: 0.0,
+            command_mps2: 0.0,
+            entry_time_s,
+            entry_speed_mps,
+            planned_exit_time_s: 0.0,
+            planned_exit_speed_mps: 0.0,
+            owed: (0, 0),
+            visit: Visit::NEW,
+            ..*self
+        }
+    }
+
+    /// Where it goes.
+    pub(super) fn way(&self) -> Way {
+        let Car { path, next_zone, next_path, then_path, route, road, hop, .. } = *self;
+        Way { path, next_zone, next_path, then_path, route, road, hop }
+    }
+
+    /// Puts it on its way through another zone.
+    pub(super) fn turn(&mut self, way: Way) {
+        let Way { path, next_zone, next_path, then_path, route, road, hop } = way;
+        (self.path, self.next_zone, self.next_path, self.then_path) = (path, next_zone, next_path, then_path);
+        (self.route, self.road, self.hop) = (route, road, hop);
     }
 
     /// Motion over the coming step.

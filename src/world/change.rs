@@ -31,14 +31,15 @@ impl World {
         fixed(old.faults == new.faults, "faults")?;
         fixed(old.network.zones.len() == new.network.zones.len(), "zones")?;
         for (a, b) in old.network.zones.iter().zip(&new.network.zones) {
-            let same = a.name == b.name && a.approaches == b.approaches && a.exit == b.exit;
+            let same = a.name == b.name && a.same_shape(b);
             fixed(same, &format!("zones.{} but for its flow", a.name))?;
         }
         fixed(old.network.roads.len() == new.network.roads.len(), "roads")?;
         for (a, b) in old.network.roads.iter().zip(&new.network.roads) {
-            let same = a.name == b.name && a.zone == b.zone && a.path == b.path;
+            let same = a.name == b.name && (a.zone, a.segment, &a.routes) == (b.zone, b.segment, &b.routes);
             fixed(same, &format!("roads.{} but for its demand", a.name))?;
         }
+        fixed(old.fleet == new.fleet, "fleet")?;
         let controllers = self.drivers().count();
         let old = std::mem::replace(&mut self.scenario, scenario);
         self.change_demand(&old);

@@ -1,7 +1,7 @@
 //! Entry roads: who arrives when, and who has to wait outside.
 
 use crate::scenario::arrivals::ArrivalStream;
-use crate::scenario::{Arrival, Road, Scenario};
+use crate::scenario::{Arrival, Circles, Road, Scenario, ZoneId};
 use crate::vehicle::Held;
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
@@ -19,6 +19,9 @@ pub(super) struct Gates {
     pub queues: Vec<Queue>,
     pub left_to_generate: u32,
     pub held: u32,
+    /// Circles of the network, and how many vehicles are inside that may come into each.
+    pub circles: Circles,
+    pub in_circles: Vec<u32>,
 }
 
 /// A road on which somebody waits to enter.
@@ -26,7 +29,8 @@ pub(super) struct Gates {
 pub(super) struct Queue {
     pub zone: u32,
     pub road: u32,
-    pub path: u32,
+    /// The road's entrance.
+    pub segment: u32,
 }
 
 /// An arrival that has not entered yet.
@@ -52,7 +56,10 @@ impl Gates {
             queues: Vec::new(),
             left_to_generate: scenario.max_vehicles.unwrap_or(u32::MAX),
             held: 0,
+            in_circles: Vec::new(),
+            circles: Circles::of(scenario),
         };
+        gates.in_circles = vec![0; gates.circles.capacity.len()];
         for road in 0..roads.len() {
             gates.draw(road);
         }
@@ -85,12 +92,33 @@ impl Gates {
             self.next.pop();
             let arrival = self.pending[road].take().expect("a queued road has a pending arrival");
             if self.waiting[road].is_empty() {
-                let Road { zone, path, .. } = roads[road];
-                self.queues.push(Queue { zone, road: road as u32, path });
+                let Road { zone, segment, .. } = roads[road];
+                self.queues.push(Queue { zone, road: road as u32, segment });
             }
             self.waiting[road].push_back(Waiting { arrival, held: false });
             self.left_to_generate -= 1;
             self.draw(road);
+        }
+    }
+
+    /// Whether the circles that a vehicle on a path may come into have room for it.
+    pub(super) fn have_room(&self, zone: ZoneId, path: u32) -> bool {
+        let ahead = self.circles.ahead_of(zone, path);
+        let mut counts = self.in_circles.iter().zip(&self.circles.capacity).enumerate();
+        counts.all(|(bit, (inside, capacity))| ahead >> bit & 1 == 0 || inside < capacity)
+    }
+
+    /// Counts a vehicle that passes from one path to another; before the first and behind the last there is none.
+    pub(super) fn pass(&mut self, from: Option<(ZoneId, u32)>, to: Option<(ZoneId, u32)>) {
+        if self.in_circles.is_empty() {
+            return;
+        }
+        let ahead =
+            |at: Option<(ZoneId, u32)>| at.map_or(0, |(zone, path)| self.circles.ahead_of(zone, path));
+        let (before, after) = (ahead(from), ahead(to));
+        for (bit, inside) in self.in_circles.iter_mut().enumerate() {
+            *inside += after >> bit & 1;
+            *inside -= before >> bit & 1;
         }
     }
 

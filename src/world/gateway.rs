@@ -5,14 +5,16 @@
 //! upstream, within a zone in passing order. So the motion of every partner is settled before the vehicles
 //! that depend on it, and the result does not depend on the order in which frames came.
 
-use super::car::{Car, Guard};
+use super::car::{Beyond, Car};
 use super::faults::Limits;
-use super::link::{Link, LinkCar};
+use super::link::LinkCar;
 use super::metrics::{ShieldRow, ShieldSummary};
+use super::owed::{Owed, Standing};
 use super::role::World;
+use crate::conflict::DutyKind;
 use crate::lanes::AHEAD;
-use crate::scenario::{Drivers, Exit, Scenario, ShieldMode, ZoneId};
-use crate::shield::{Duty, Partner, RESERVE_M, Row, Shield};
+use crate::scenario::{Drivers, Scenario, ShieldMode, VehicleParams};
+use crate::shield::{Partner, RESERVE_M, Row, Shield};
 use crate::vehicle::Held;
 use ipc_schemas::{self as frames, VehicleCommand};
 use std::collections::HashMap;
@@ -125,11 +127,12 @@ const EXIT_MPS2: f64 = 2.0;
 #[derive(Debug)]
 pub(super) struct Gateway {
     mode: ShieldMode,
-    shield: Shield,
+    /// By kind of vehicle.
+    shields: Vec<Shield>,
     drivers: Drivers,
     rows: Vec<ShieldRow>,
-    /// Motion over the step of each zone's members, in passing order; kept for its allocation.
-    partners: Vec<Partner>,
+    /// The partners of one vehicle, and which of its duties each belongs to; kept for its allocation.
+    partners: Vec<(Partner, usize)>,
     /// Whether a command of this step is to be shielded whatever the mode.
     falls_back: bool,
 }
@@ -142,7 +145,7 @@ impl Gateway {
             .chain(scenario.plugins.iter().map(|p| p.name.clone()));
         Gateway {
             mode: scenario.shield,
-            shield: Shield::new(&scenario.vehicle, scenario.dt_s()),
+            shields: scenario.fleet.iter().map(|kind| Shield::new(&kind.vehicle, scenario.dt_s())).collect(),
             rows: names.map(ShieldRow::new).collect(),
             drivers,
             partners: Vec::with_capacity(2),
@@ -206,7 +209,7 @@ impl World {
         commands: &[VehicleCommand],
         greatest_verdict: u16,
     ) -> Result<(), CommandFault> {
-        let limits = self.scenario.vehicle;
+        let kinds = &self.kinds;
         let Gateway { mode, drivers, rows, falls_back, .. } = &mut self.gateway;
         let (mut beyond, mut not_finite) = (0, 0);
         let mut next = 0;
@@ -218,7 +221,7 @@ impl World {
                 driver => driver.is_none(),
             };
             self.cars.fetch(zone as usize + AHEAD);
-            let first = self.sites[zone as usize].first();
+            let first = self.zones[zone as usize].first();
             for car in &mut self.cars[zone as usize][first..] {
                 if shared && drivers.of(zone, car.path) != sender {
                     continue;
@@ -246,6 +249,7 @@ impl World {
                 }
                 let mut u = command.u_mps2;
                 car.visit.beyond = false;
+                let limits = &kinds[usize::from(car.kind)];
                 let (min_mps2, max_mps2) = (limits.u_min_mps2, limits.u_max_mps2);
                 // Written so that NaN is no exception.
                 if !(u >= min_mps2 && u <= max_mps2) {
@@ -301,7 +305,6 @@ impl World {
         remembered: &[VehicleCommand],
         verdict: u16,
     ) -> Vec<VehicleCommand> {
-        let limits = &self.scenario.vehicle;
         let dt_s = self.scenario.dt_s();
         let memories: HashMap<(u32, u32), &VehicleCommand> =
             remembered.iter().map(|c| ((c.zone, c.vehicle), c)).collect();
@@ -313,6 +316,7 @@ impl World {
             .filter(|(zone, car)| drivers.of(*zone, car.path) == controller)
             .map(|(zone, car)| {
                 let memory = memories.get(&(zone, car.vehicle)).map_or_else(VehicleCommand::default, |c| **c);
+                let limits = &self.kinds[usize::from(car.kind)];
                 let fastest_mps2 = (limits.v_max_mps - car.v_mps) / dt_s;
                 // What it had is what the state frame says it did: a bad frame may have changed the command.
                 let held_mps2 = memories.get(&(zone, car.vehicle)).map_or(0.0, |_| car.u_mps2);
@@ -353,7 +357,7 @@ impl World {
             return CommandFault::Duplicate { record, vehicle };
         }
         let mut driver = None;
-        for zone in 0..self.sites.len() {
+        for zone in 0..self.zones.len() {
             if let Some(car) = self.members(zone).iter().find(|c| c.vehicle == vehicle) {
                 driver = Some(self.gateway.drivers.of(zone as u32, car.path));
             }
@@ -367,154 +371,202 @@ impl World {
     }
 
     /// Settles what every vehicle holds over the step: what has reached it, shielded. Zones downstream first,
-    /// and within a zone in passing order, so that whoever a vehicle depends on has been settled before.
+    /// and within a zone in passing order, so that whoever a vehicle depends on has been settled before. Where the
+    /// network closes a circle somebody comes first: for the vehicles it depends on that are not settled yet, it
+    /// reckons with full braking.
     pub(super) fn hold_all(&mut self, scenario: &Scenario, dt_s: f64) {
         if let Some(faults) = self.faults.as_mut().filter(|faults| faults.has_channels()) {
             let time_s = scenario.time_s(self.step);
-            let sites = &self.sites;
-            faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, |z| sites[z].first());
+            let zones = &self.zones;
+            faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, |z| zones[z].first());
         }
-        for zone in (0..self.sites.len()).rev() {
-            if self.on_links > 0 {
-                self.drive_link(scenario, zone, dt_s);
+        let shields = self.gateway.mode != ShieldMode::Off || self.gateway.falls_back;
+        for zone in (0..self.zones.len()).rev() {
+            if self.links.cars > 0 {
+                self.links.range(zone as u32).for_each(|link| self.drive_link(scenario, zone, link, dt_s));
             }
-            if self.sites[zone].has_left {
-                self.hold_left(scenario, zone);
-            }
-            if self.gateway.mode != ShieldMode::Off || self.gateway.falls_back {
+            self.hold_left(scenario, zone, shields);
+            if shields {
                 self.shield_zone(zone);
             }
+        }
+        // What was assumed of vehicles that had left is replaced by what they do.
+        while let Some((zone, at)) = self.scratch.assumed.pop() {
+            self.cars[zone as usize][at].command_mps2 = self.followed(scenario, zone as usize, at).u_mps2;
         }
         self.gateway.falls_back = false;
     }
 
-    /// Index 0 moves with the vehicle it stands for.
-    pub(super) fn hold_left(&mut self, scenario: &Scenario, zone: usize) {
-        let mut left_from = self.sites[zone].left_from;
-        let u = self.left_mps2(scenario, zone, &mut left_from, &self.cars[zone][0]);
-        self.sites[zone].left_from = left_from;
-        self.cars[zone][0].command_mps2 = u;
-    }
-
-    /// What a vehicle that has left a zone holds over the step; `left_from` is the last zone it is known to
-    /// have left.
-    pub(super) fn left_mps2(
-        &self,
-        scenario: &Scenario,
-        zone: usize,
-        left_from: &mut ZoneId,
-        car: &Car,
-    ) -> f64 {
-        let u = self.followed_mps2(left_from, car.vehicle);
-        // Out of the network nobody drives it. Whoever left it creeping must not creep for ever: those behind
-        // would have to leave more slowly each, down to a standstill.
-        if self.sites[zone].exit == Exit::Out && car.v_mps < LEAST_EXIT_MPS {
-            return EXIT_MPS2.min(scenario.vehicle.u_max_mps2);
+    /// Those that have left a zone move with the vehicles they stand for. With `settling`, what is not settled yet
+    /// is taken for full braking until it is.
+    pub(super) fn hold_left(&mut self, scenario: &Scenario, zone: usize, settling: bool) {
+        for at in 0..self.zones[zone].first() {
+            let Followed { u_mps2, is_settled } = self.followed(scenario, zone, at);
+            let car = &mut self.cars[zone][at];
+            car.command_mps2 = u_mps2;
+            if settling && !is_settled {
+                car.command_mps2 = self.kinds[usize::from(car.kind)].u_min_mps2;
+                self.scratch.assumed.push((zone as u32, at));
+            }
         }
-        u
     }
 
-    /// What a vehicle holds over the step, wherever it is now; 0 once it has left the network.
-    fn followed_mps2(&self, left_from: &mut ZoneId, vehicle: u32) -> f64 {
-        loop {
-            let from = *left_from as usize;
-            if self.on_links > 0
-                && let Some(on_link) = self.links[from].cars.iter().find(|c| c.car.vehicle == vehicle)
+    /// What a vehicle that left a zone holds over the step, wherever it is now.
+    fn followed(&mut self, scenario: &Scenario, zone: usize, at: usize) -> Followed {
+        let mut car = self.cars[zone][at];
+        let followed = self.follow(scenario, zone, &mut car);
+        self.cars[zone][at].beyond = car.beyond;
+        followed
+    }
+
+    /// The same, of a vehicle that need not be among the zone's; it is told how far it has come.
+    pub(super) fn follow(&self, scenario: &Scenario, zone: usize, car: &mut Car) -> Followed {
+        let Car { vehicle, v_mps, kind, mut beyond, .. } = *car;
+        let found = loop {
+            if self.links.cars > 0
+                && let Some(link) = self.links.behind(beyond.zone, beyond.exit)
+                && let Some(on_link) = self.links.all[link].cars.iter().find(|c| c.car.vehicle == vehicle)
             {
-                return on_link.held.u_mps2;
+                break Some((on_link.held.u_mps2, beyond.zone as usize >= zone));
             }
-            let Exit::Zone { zone: next, .. } = self.sites[from].exit else { return 0.0 };
-            if let Some(car) = self.members(next as usize).iter().rev().find(|c| c.vehicle == vehicle) {
-                return car.command_mps2;
+            let exit = &scenario.network.zones[beyond.zone as usize].exits[beyond.exit as usize];
+            let Some(to) = exit.to else { break None };
+            if let Some(car) = self.members(to.zone as usize).iter().rev().find(|c| c.vehicle == vehicle) {
+                beyond.next_exit = self.conflicts[to.zone as usize].exit(car.path);
+                break Some((car.command_mps2, to.zone as usize > zone));
             }
-            *left_from = next;
+            beyond = Beyond { zone: to.zone, exit: beyond.next_exit, next_exit: 0 };
+        };
+        car.beyond = beyond;
+        match found {
+            Some((u_mps2, is_settled)) => Followed { u_mps2, is_settled },
+            // Out of the network nobody drives it. Whoever left it creeping must not creep for ever: those behind
+            // would have to leave more slowly each, down to a standstill.
+            None if v_mps < LEAST_EXIT_MPS => {
+                let u_max_mps2 = self.kinds[usize::from(kind)].u_max_mps2;
+                Followed { u_mps2: EXIT_MPS2.min(u_max_mps2), is_settled: true }
+            }
+            None => Followed { u_mps2: 0.0, is_settled: true },
         }
     }
 
     /// Projects the commands of a zone's members, in passing order.
     fn shield_zone(&mut self, zone: usize) {
-        let lengths_m = &self.lengths_m[zone];
-        let Gateway { mode, shield, drivers, rows, partners, .. } = &mut self.gateway;
+        let Gateway { mode, shields, drivers, rows, partners, .. } = &mut self.gateway;
         let cars = &mut self.cars[zone];
-        for i in self.sites[zone].first()..cars.len() {
-            let (before, rest) = cars.split_at_mut(i);
-            let car = &mut rest[0];
+        let owed = &mut self.owed[zone];
+        for &at in &self.order[zone] {
+            let car = cars[at as usize];
             let falls_back = car.visit.verdict == frames::VERDICT_FALLBACK;
             if *mode == ShieldMode::Off && !falls_back {
                 continue;
             }
-            // The partners of `coordination::partners`, from the same order.
-            let ahead = before.iter().rev().find(|c| c.path == car.path);
-            let previous = before.last().filter(|c| c.path != car.path);
-            let own_length_m = lengths_m[car.path as usize];
-            let merge = Duty::Merge { conflict_m: own_length_m };
+            let shield = &shields[usize::from(car.kind)];
+            let row = &mut rows[drivers.of(zone as u32, car.path) as usize];
             partners.clear();
-            for (duty, other) in [(Duty::RearEnd, ahead), (merge, previous)] {
-                let Some(other) = other else { continue };
-                let shift_m = own_length_m - lengths_m[other.path as usize];
-                let motion = Held::new(other.x_m + shift_m, other.v_mps, other.command_mps2);
-                let partner = Partner { duty, motion };
-                let guard =
-                    if duty == Duty::RearEnd { &mut car.visit.rear_end } else { &mut car.visit.merge };
-                let row = &mut rows[drivers.of(zone as u32, car.path) as usize];
+            for (at, owed) in owed[car.owed.0 as usize..car.owed.1 as usize].iter_mut().enumerate() {
+                let other = &cars[owed.duty.partner as usize];
+                let Some(partner) = partner(owed, &car, other, &self.kinds) else { continue };
                 // Judged when the vehicle comes to owe this partner something, and held to it from then on.
-                if guard.partner != other.vehicle {
+                if owed.standing == Standing::Unknown {
                     let safe = shield.state_slack_m(car.x_m, car.v_mps, &partner) >= RESERVE_M;
-                    *guard = Guard { partner: other.vehicle, safe };
+                    owed.standing = if safe { Standing::Safe } else { Standing::Unsafe };
                     row.began_unsafe += u32::from(!safe);
                 }
-                partners.push(partner);
+                partners.push((partner, at));
             }
-            let row = &mut rows[drivers.of(zone as u32, car.path) as usize];
             row.commands += 1;
-            let found = shield.project(car.x_m, car.v_mps, car.command_mps2, partners.iter().copied());
+            let all = partners.iter().map(|(partner, _)| *partner);
+            let found = shield.project(car.x_m, car.v_mps, car.command_mps2, all);
             row.bounded += u64::from(car.visit.beyond || found.row.is_some());
             match found.row {
                 None => {}
                 Some(Row::Speed) => row.speed += 1,
                 Some(Row::RearEnd) => row.rear_end += 1,
                 Some(Row::Merge) => row.merge += 1,
+                Some(Row::Cross) => row.cross += 1,
             }
             if *mode == ShieldMode::On || falls_back {
-                car.command_mps2 = found.u_mps2;
+                cars[at as usize].command_mps2 = found.u_mps2;
             }
-            let held = car.held();
-            for partner in partners.iter() {
-                let (guard, least) = if partner.duty == Duty::RearEnd {
-                    (car.visit.rear_end, &mut row.min_rear_end_margin_m)
-                } else {
-                    (car.visit.merge, &mut row.min_merge_margin_m)
-                };
-                if guard.safe {
-                    let margin = shield.least_margin_m(&held, partner);
-                    if margin < least.unwrap_or(f64::INFINITY) {
-                        *least = Some(margin);
-                    }
-                    row.lost += u32::from(shield.slack_after_m(&held, partner) < 0.0);
+            let held = cars[at as usize].held();
+            for (partner, at) in partners.iter() {
+                if owed[car.owed.0 as usize + at].standing != Standing::Safe {
+                    continue;
                 }
+                let least = match partner.kind {
+                    DutyKind::RearEnd => &mut row.min_rear_end_margin_m,
+                    DutyKind::Merge => &mut row.min_merge_margin_m,
+                    DutyKind::Cross => &mut row.min_cross_margin_m,
+                };
+                let margin = shield.least_margin_m(&held, partner);
+                if margin < least.unwrap_or(f64::INFINITY) {
+                    *least = Some(margin);
+                }
+                row.lost += u32::from(shield.slack_after_m(&held, partner) < 0.0);
             }
         }
     }
 
-    /// Lets the vehicles on the link behind a zone choose, front first, so that each sees what its leader
-    /// will do.
-    fn drive_link(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) {
-        if self.links[zone].cars.is_empty() {
+    /// Lets the vehicles on a link choose, front first, so that each sees what its leader will do.
+    fn drive_link(&mut self, scenario: &Scenario, zone: usize, link: usize, dt_s: f64) {
+        if self.links.all[link].cars.is_empty() {
             return;
         }
-        let Exit::Zone { zone: down, path, link_m, .. } = scenario.network.zones[zone].exit else { return };
-        let last = self.members(down as usize).iter().rev().find(|c| c.path == path);
-        let mut leader = last.map(|c| Held::new(c.x_m + link_m, c.v_mps, c.command_mps2));
-        let Link { speed_mps, cars, .. } = &mut self.links[zone];
-        for LinkCar { car, held } in cars {
+        let to = self.links.all[link].to;
+        let there = &scenario.network.zones[to.zone as usize];
+        let enters = |path: u32| there.paths[path as usize].segments[0] == to.segment;
+        let last = self.members(to.zone as usize).iter().rev().find(|c| enters(c.path));
+        // In a network that closes a circle the zone there may not be settled yet.
+        let is_settled = to.zone as usize > zone;
+        let mut leader = last.map(|c| {
+            let u_mps2 = if is_settled { c.command_mps2 } else { self.kinds[usize::from(c.kind)].u_min_mps2 };
+            (Held::new(c.x_m + to.link_m, c.v_mps, u_mps2), c.kind)
+        });
+        let Gateway { mode, shields, .. } = &self.gateway;
+        for LinkCar { car, held } in &mut self.links.all[link].cars {
             let k = scenario.control.k_rear_end_per_s;
-            let mut u = super::link::drive(car, *speed_mps, leader.as_ref(), &scenario.vehicle, k, dt_s);
-            if self.gateway.mode == ShieldMode::On {
-                let partner = leader.map(|motion| Partner { duty: Duty::RearEnd, motion });
-                u = self.gateway.shield.project(car.x_m, car.v_mps, u, partner.into_iter()).u_mps2;
+            let own = &self.kinds[usize::from(car.kind)];
+            let gap_m = |other: u16| {
+                let extra_m = self.kinds[usize::from(other)].length_m - scenario.vehicle.length_m;
+                own.standstill_gap_m + extra_m.max(0.0)
+            };
+            let ahead = leader.map(|(motion, kind)| (motion, gap_m(kind)));
+            let mut u = super::link::drive(car, to.link_speed_mps, ahead, own, k, dt_s);
+            if *mode == ShieldMode::On {
+                let partner = leader.map(|(motion, kind)| Partner {
+                    kind: DutyKind::RearEnd,
+                    at_m: 0.0,
+                    gap_m: gap_m(kind),
+                    braking_mps2: -self.kinds[usize::from(kind)].u_min_mps2,
+                    motion,
+                });
+                let shield = &shields[usize::from(car.kind)];
+                u = shield.project(car.x_m, car.v_mps, u, partner.into_iter()).u_mps2;
             }
             *held = Held::new(car.x_m, car.v_mps, u);
-            leader = Some(*held);
+            leader = Some((*held, car.kind));
         }
     }
+}
+
+/// What a vehicle that left a zone holds over the step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Followed {
+    pub u_mps2: f64,
+    /// Whether that is settled when the zone it left is about to be.
+    is_settled: bool,
+}
+
+/// A partner as the shield sees it, while something is owed to it.
+fn partner(owed: &Owed, car: &Car, other: &Car, kinds: &[VehicleParams]) -> Option<Partner> {
+    let duty = &owed.duty;
+    let kind = duty.in_force(car.x_m, other.x_m)?;
+    Some(Partner {
+        kind,
+        at_m: duty.own_m,
+        gap_m: duty.gap_m,
+        braking_mps2: -kinds[usize::from(other.kind)].u_min_mps2,
+        motion: Held::new(other.x_m + duty.shift_m(), other.v_mps, other.command_mps2),
+    })
 }

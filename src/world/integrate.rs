@@ -1,13 +1,16 @@
 //! One step of the world: exact motion, exact crossing instants, cost and margin accounting.
 
-use super::car::{Car, Visit};
-use super::gate::{Queue, may_enter};
+use super::car::{Beyond, Car, Visit};
+use super::gate::{Queue, Waiting, may_enter};
 use super::link::{Link, LinkCar};
 use super::metrics::CompletedVisit;
-use super::role::World;
+use super::owed::Owed;
+use super::role::{Scratch, World};
+use super::way::Ways;
+use crate::conflict::DutyKind;
 use crate::lanes::AHEAD;
-use crate::scenario::{Exit, Scenario, ZoneId};
-use crate::vehicle::{Held, Merge, Pair, RearEnd, satisfiable_at};
+use crate::scenario::{Downstream, Scenario, VehicleParams, ZoneId};
+use crate::vehicle::{Held, Merge, Pair, RearEnd};
 use ipc_schemas::{VERDICT_FE, VERDICT_INFEASIBLE};
 
 /// A vehicle about to enter a zone at the end of the step.
@@ -21,7 +24,8 @@ pub(super) struct Entry {
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Leader {
     road: u32,
-    motion: Option<Held>,
+    /// With its kind.
+    motion: Option<(Held, u16)>,
 }
 
 impl World {
@@ -30,9 +34,11 @@ impl World {
         let scenario = self.scenario.clone();
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
+        self.derive_duties(&scenario);
         // Where vehicles in zones depend on nobody's command but their own, each zone settles what they hold
         // as its turn comes: what is downstream of it has not moved yet.
-        let alone = self.on_links == 0 && self.gateway.is_off() && self.faults.is_none();
+        let alone =
+            self.links.cars == 0 && self.gateway.is_off() && self.faults.is_none() && !self.closes_a_circle;
         if !alone {
             self.hold_all(&scenario, dt_s);
         }
@@ -40,123 +46,124 @@ impl World {
         self.scratch.leaders.clear();
         self.events.clear();
         self.gates.advance(&scenario.network.roads, scenario.time_s(self.step + 1));
-        if self.on_links > 0 {
-            (0..self.links.len()).for_each(|zone| self.observe_link_overlaps(&scenario, zone, dt_s));
+        for link in 0..if self.links.cars > 0 { self.links.all.len() } else { 0 } {
+            self.observe_link_overlaps(&scenario, link, dt_s);
         }
         let mut queue = 0;
         // All that concerns a zone at one go, while its vehicles are in the cache. Motions start from the
         // step's beginning, so it does not matter which zone has moved on already.
-        for zone in 0..self.sites.len() {
+        for zone in 0..self.zones.len() {
             self.cars.fetch(zone + AHEAD);
-            if alone && self.sites[zone].has_left {
-                self.hold_left(&scenario, zone);
+            if alone {
+                self.hold_left(&scenario, zone, false);
             }
             let crosses = self.look(&scenario, zone, dt_s);
-            self.observe_overlaps(&scenario, zone, dt_s, crosses);
-            self.sites[zone].left_now = crosses;
+            self.observe_overlaps(&scenario, zone, dt_s);
+            self.zones[zone].left_now = crosses;
             if crosses {
                 self.cross(&scenario, zone, now_s, dt_s);
                 self.events.push(zone as ZoneId);
             }
-            while let Some(Queue { road, path, .. }) =
+            while let Some(Queue { road, segment, .. }) =
                 self.gates.queues.get(queue).filter(|q| q.zone as usize == zone)
             {
-                // The last of the path, be it one that has left in this very step: what matters is the road
+                // The last to enter here, be it one that has left in this very step: what matters is the road
                 // right behind it.
-                let at = self.cars[zone].iter().rposition(|c| c.path == *path);
-                let motion = at.map(|at| self.scratch.motions[at]);
+                let paths = &scenario.network.zones[zone].paths;
+                let at = self.cars[zone].iter().rposition(|c| paths[c.path as usize].segments[0] == *segment);
+                let motion = at.map(|at| (self.scratch.motions[at], self.cars[zone][at].kind));
                 self.scratch.leaders.push(Leader { road: *road, motion });
                 queue += 1;
             }
             self.settle(zone, dt_s);
         }
-        if self.on_links > 0 {
-            for zone in 0..self.links.len() {
-                self.leave_link(zone, now_s, dt_s);
-                self.links[zone].cars.iter_mut().for_each(|c| c.car.move_on(&c.held, dt_s));
+        if self.links.cars > 0 {
+            for link in 0..self.links.all.len() {
+                self.leave_link(link, now_s, dt_s);
+                self.links.all[link].cars.iter_mut().for_each(|c| c.car.move_on(&c.held, dt_s));
             }
         }
         self.admit(&scenario, now_s, dt_s);
         self.enter();
     }
 
-    /// Works out the motions of a zone's cars, updates the least rear-end margins over the step, and notes,
-    /// for vehicles seen for the first time, whether their entry conditions hold. Returns whether a vehicle
-    /// passes the conflict point.
+    /// Works out the motions of a zone's cars, updates the least margins over the step, and notes, for vehicles
+    /// seen for the first time, whether their entry conditions hold. Returns whether a vehicle leaves the zone.
     fn look(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) -> bool {
-        let (phi, gap) = (scenario.vehicle.reaction_time_s, scenario.vehicle.standstill_gap_m);
         let lengths_m = &self.lengths_m[zone];
-        let motions = &mut self.scratch.motions;
-        let cars = &mut self.cars[zone];
-        let mut crosses = false;
-        motions.clear();
-        motions.extend(cars.iter().map(Car::held));
-        for i in self.sites[zone].first()..cars.len() {
-            let (before, rest) = cars.split_at_mut(i);
-            let (car, held) = (&mut rest[0], &motions[i]);
-            match car.visit.verdict {
-                VERDICT_FE => car.visit.fe_s += dt_s,
-                VERDICT_INFEASIBLE => car.visit.infeasible = true,
-                _ => {}
-            }
-            let ahead_at = before.iter().rposition(|c| c.path == car.path);
-            if car.visit.entered {
-                let previous = before.last().filter(|c| c.path != car.path);
-                note_entry_conditions(scenario, lengths_m, car, ahead_at.map(|at| &before[at]), previous);
-            }
-            let after_s = held.passes_m(lengths_m[car.path as usize], dt_s);
-            crosses |= after_s.is_some();
-            let Some(at) = ahead_at else { continue };
-            let margin = held.least_margin_m(&motions[at], 0.0, phi, gap, after_s.unwrap_or(dt_s));
-            car.visit.least_rear_end_m = car.visit.least_rear_end_m.min(margin);
-            if before[at].x_m < car.x_m {
-                self.metrics[zone].overtakes += 1;
-            }
-        }
-        crosses
-    }
-
-    /// Takes out the vehicles that pass the conflict point during the step and sends them on.
-    fn cross(&mut self, scenario: &Scenario, zone: usize, now_s: f64, dt_s: f64) {
-        let lengths_m = &self.lengths_m[zone];
-        let site = &mut self.sites[zone];
+        let owed = &self.owed[zone];
         let metrics = &mut self.metrics[zone];
         let motions = &mut self.scratch.motions;
-        let overlaps = &mut self.overlaps;
-        let body_m = scenario.vehicle.length_m;
-        let mut pass_over = |car: &Car, held: &Held, left_from: ZoneId| {
-            let mut car = *car;
-            car.move_on(held, dt_s);
-            overlaps.keep_tail(zone, car, left_from, lengths_m[car.path as usize], body_m);
-        };
-        let first_member = site.first();
-        let mut last: Option<(f64, Car, Held)> = None;
-        let mut kept = first_member;
         let cars = &mut self.cars[zone];
-        for i in first_member..cars.len() {
-            let (car, held) = (cars[i], motions[i]);
+        let mut leaves = false;
+        motions.clear();
+        motions.extend(cars.iter().map(Car::held));
+        for i in self.zones[zone].first()..cars.len() {
+            let (car, held) = (cars[i], &motions[i]);
+            let owed = &owed[car.owed.0 as usize..car.owed.1 as usize];
+            let own = &self.kinds[usize::from(car.kind)];
+            let mut visit = car.visit;
+            match visit.verdict {
+                VERDICT_FE => visit.fe_s += dt_s,
+                VERDICT_INFEASIBLE => visit.infeasible = true,
+                _ => {}
+            }
+            if visit.entered {
+                note_entry_conditions(scenario, own, &car, owed, cars, &mut visit);
+            }
+            let after_s = held.passes_m(lengths_m[car.path as usize], dt_s);
+            leaves |= after_s.is_some();
+            for Owed { duty, .. } in owed {
+                let other = &cars[duty.partner as usize];
+                let Some(kind) = duty.in_force(car.x_m, other.x_m) else { continue };
+                let motion = &motions[duty.partner as usize];
+                if kind == DutyKind::RearEnd {
+                    let end_s = after_s.unwrap_or(dt_s);
+                    let (phi, shift_m) = (own.reaction_time_s, duty.shift_m());
+                    let margin = held.least_margin_m(motion, shift_m, phi, duty.gap_m, end_s);
+                    visit.least_rear_end_m = visit.least_rear_end_m.min(margin);
+                    metrics.overtakes += u32::from(other.x_m + shift_m < car.x_m);
+                    continue;
+                }
+                let Some(passes_s) = held.passes_m(duty.own_m, dt_s) else { continue };
+                let there_m = motion.position_m(passes_s);
+                metrics.order_violations += u32::from(there_m < duty.partner_m);
+                let margin = there_m + duty.shift_m()
+                    - duty.own_m
+                    - own.reaction_time_s * held.speed_mps(passes_s)
+                    - duty.gap_m;
+                let least =
+                    if kind == DutyKind::Merge { &mut visit.least_merge_m } else { &mut visit.least_cross_m };
+                *least = least.min(margin);
+            }
+            cars[i].visit = visit;
+        }
+        leaves
+    }
+
+    /// Takes out the vehicles that leave the zone during the step and sends them on.
+    fn cross(&mut self, scenario: &Scenario, zone: usize, now_s: f64, dt_s: f64) {
+        let shape = &scenario.network.zones[zone];
+        let ways = Ways::of(scenario);
+        let lengths_m = &self.lengths_m[zone];
+        let Scratch { motions, cars: kept, moved, entries, leaving, .. } = &mut self.scratch;
+        leaving.clear();
+        kept.clear();
+        moved.clear();
+        let first = self.zones[zone].first();
+        let cars = &self.cars[zone];
+        kept.extend_from_slice(&cars[..first]);
+        moved.extend_from_slice(&motions[..first]);
+        for (car, held) in cars[first..].iter().zip(&motions[first..]) {
             let length_m = lengths_m[car.path as usize];
-            let Some(after_s) = held.passes_m(length_m, dt_s) else {
-                (cars[kept], motions[kept]) = (car, held);
-                kept += 1;
-                continue;
-            };
-            let first = last.as_ref().is_none_or(|(instant, ..)| *instant <= after_s);
-            // A member kept so far entered earlier and is still inside.
-            metrics.order_violations += u32::from(kept > first_member || !first);
+            let Some(after_s) = held.passes_m(length_m, dt_s) else { continue };
+            let exit = shape.paths[car.path as usize].exit;
+            let beyond = Beyond { zone: zone as ZoneId, exit, next_exit: 0 };
+            leaving.push((after_s, Car { beyond, ..*car }, *held));
             let mut visit = car.visit;
             visit.energy += held.energy(after_s);
-            // What has been kept has moved up, but never as far as the place before this one.
-            let previous = i.checked_sub(1).map(|at| (&cars[at], &motions[at]));
-            let merge_margin_m = previous.filter(|(p, _)| p.path != car.path).map(|(p, motion)| {
-                let shift = length_m - lengths_m[p.path as usize];
-                motion.position_m(after_s) + shift
-                    - length_m
-                    - scenario.vehicle.reaction_time_s * held.speed_mps(after_s)
-                    - scenario.vehicle.standstill_gap_m
-            });
             let instant_s = now_s + after_s;
-            metrics.leave(&visit, instant_s - car.entry_time_s, merge_margin_m);
+            self.metrics[zone].leave(&visit, instant_s - car.entry_time_s);
             if let Some(visits) = &mut self.visits {
                 visits.push(CompletedVisit {
                     vehicle: car.vehicle,
@@ -168,103 +175,126 @@ impl World {
                     fe_s: visit.fe_s,
                 });
             }
-            if first {
-                if let Some((_, car, held)) = last.replace((after_s, car, held)) {
-                    pass_over(&car, &held, zone as ZoneId);
-                }
-            } else {
-                pass_over(&car, &held, zone as ZoneId);
-            }
-            let Exit::Zone { zone: down, path, link_m, .. } = site.exit else {
+            let to = shape.exits[exit as usize].to;
+            let onward = to.map(|to| (to.zone, car.next_path));
+            self.gates.pass(Some((zone as ZoneId, car.path)), onward);
+            let Some(Downstream { zone: down, link_m, .. }) = to else {
                 self.departed += 1;
                 continue;
             };
-            let mut next = Car::entering(car.vehicle, path, instant_s, held.speed_mps(after_s));
-            next.move_on(&held, dt_s);
+            let mut next = car.passing(instant_s, held.speed_mps(after_s));
+            next.move_on(held, dt_s);
             next.x_m -= length_m;
             // The rest of the step is driven under the old command and paid for in the new zone.
             next.visit.energy = held.energy(dt_s) - held.energy(after_s);
+            next.turn(ways.onward(next.way(), next.vehicle, down));
             if link_m > 0.0 {
                 // Its motion starts at the link's origin.
                 let held = Held::new(held.x0_m - length_m, held.v0_mps, held.u_mps2);
-                self.links[zone].cars.push(LinkCar { car: next, held });
-                self.on_links += 1;
+                let link = self.links.behind(zone as ZoneId, exit).expect("an exit with a link has one");
+                self.links.all[link].cars.push(LinkCar { car: next, held });
+                self.links.cars += 1;
             } else {
-                self.scratch.entries.push(Entry { zone: down, car: next });
+                entries.push(Entry { zone: down, car: next });
             }
         }
-        let (_, car, held) = last.expect("somebody crosses");
-        if site.has_left {
-            pass_over(&cars[0], &motions[0], site.left_from);
-        } else {
-            // The first to leave makes room for itself.
-            cars.copy_within(..kept, 1);
-            motions.copy_within(..kept, 1);
-            kept += 1;
-            site.has_left = true;
-            self.with_left += 1;
+        leaving.sort_by(|a, b| a.0.total_cmp(&b.0));
+        kept.extend(leaving.iter().map(|(_, car, _)| *car));
+        moved.extend(leaving.iter().map(|(.., held)| *held));
+        // Of those that have left the last toward each way stays, and whoever may still stand in a conflict area.
+        let (conflicts, kinds) = (&self.conflicts[zone], &self.kinds);
+        let way = |car: &Car| (conflicts.exit(car.path), car.next_path);
+        let mut left = 0;
+        for at in 0..kept.len() {
+            let car = kept[at];
+            let is_last = !kept[at + 1..].iter().any(|later| way(later) == way(&car));
+            let own = &kinds[usize::from(car.kind)];
+            let reach_m = self.reach_m;
+            let clears_m = conflicts.clears_behind_m(car.path, own.length_m, reach_m);
+            if is_last || car.x_m - lengths_m[car.path as usize] < clears_m {
+                (kept[left], moved[left]) = (car, moved[at]);
+                left += 1;
+            } else {
+                let mut car = car;
+                car.move_on(&moved[at], dt_s);
+                self.overlaps.keep_tail(zone, car, lengths_m[car.path as usize] + own.length_m);
+            }
         }
-        (cars[0], motions[0]) = (car, held);
-        site.left_from = zone as ZoneId;
-        self.cars.truncate(zone, kept);
+        kept.truncate(left);
+        moved.truncate(left);
+        for (car, held) in cars[first..].iter().zip(&motions[first..]) {
+            if held.passes_m(lengths_m[car.path as usize], dt_s).is_none() {
+                kept.push(*car);
+                moved.push(*held);
+            }
+        }
+        self.left = self.left + left - first;
+        self.zones[zone].left = left as u32;
+        self.cars.set(zone, kept);
+        std::mem::swap(motions, moved);
     }
 
     /// Takes vehicles off the end of a link into the next zone.
-    fn leave_link(&mut self, zone: usize, now_s: f64, dt_s: f64) {
-        let Exit::Zone { zone: down, path, .. } = self.sites[zone].exit else { return };
-        let Link { length_m, cars, .. } = &mut self.links[zone];
+    fn leave_link(&mut self, link: usize, now_s: f64, dt_s: f64) {
+        let Link { to, cars, .. } = &mut self.links.all[link];
         let mut at = 0;
         // All of them: where one has passed another, the first in the list is not the foremost.
         while let Some(LinkCar { car, held }) = cars.get(at) {
-            let Some(after_s) = held.passes_m(*length_m, dt_s) else {
+            let Some(after_s) = held.passes_m(to.link_m, dt_s) else {
                 at += 1;
                 continue;
             };
-            let mut next = Car::entering(car.vehicle, path, now_s + after_s, held.speed_mps(after_s));
+            let mut next = car.passing(now_s + after_s, held.speed_mps(after_s));
             next.move_on(held, dt_s);
-            next.x_m -= *length_m;
+            next.x_m -= to.link_m;
             next.visit.energy = held.energy(dt_s) - held.energy(after_s);
-            self.scratch.entries.push(Entry { zone: down, car: next });
+            self.scratch.entries.push(Entry { zone: to.zone, car: next });
             cars.remove(at);
-            self.on_links -= 1;
+            self.links.cars -= 1;
         }
     }
 
     /// Lets arrivals of this step in, as far as the road ahead of them allows.
     fn admit(&mut self, scenario: &Scenario, now_s: f64, dt_s: f64) {
-        let vehicle = &scenario.vehicle;
-        let gap_m = vehicle.length_m + vehicle.standstill_gap_m;
+        let ways = Ways::of(scenario);
         // Vehicles are numbered in order of road.
         self.scratch.leaders.sort_unstable_by_key(|leader| leader.road);
         for &Leader { road, motion: mut leader } in &self.scratch.leaders {
-            let waiting_here = &mut self.gates.waiting[road as usize];
-            let crate::scenario::Road { zone, path, .. } = scenario.network.roads[road as usize];
-            while let Some(waiting) = waiting_here.front_mut() {
-                let mut speed_mps = waiting.arrival.speed_mps;
+            let zone = scenario.network.roads[road as usize].zone;
+            while let Some(&Waiting { arrival, held }) = self.gates.waiting[road as usize].front() {
+                let id = self.arrived;
+                let way = ways.at_road(road, id, arrival.route);
+                let kind = scenario.kind_of(id);
+                let own = &self.kinds[usize::from(kind)];
+                let mut speed_mps = arrival.speed_mps;
                 // An arrival at the very end of the step may come out a rounding later.
-                let mut after_s = (waiting.arrival.time_s - now_s).min(dt_s);
-                if waiting.held {
+                let mut after_s = (arrival.time_s - now_s).min(dt_s);
+                if held {
                     after_s = dt_s;
-                    speed_mps = leader.map_or(speed_mps, |l| speed_mps.min(l.speed_mps(dt_s)));
+                    speed_mps = leader.map_or(speed_mps, |(l, _)| speed_mps.min(l.speed_mps(dt_s)));
                 }
-                let free =
-                    leader.is_none_or(|l| may_enter(&l, after_s, speed_mps, gap_m, vehicle.u_min_mps2, dt_s));
-                if !free {
-                    if !waiting.held {
-                        waiting.held = true;
+                let free = leader.is_none_or(|(motion, kind): (Held, u16)| {
+                    let gap_m = self.kinds[usize::from(kind)].length_m + own.standstill_gap_m;
+                    may_enter(&motion, after_s, speed_mps, gap_m, own.u_min_mps2, dt_s)
+                });
+                let has_room = self.gates.have_room(zone, way.path);
+                let waiting_here = &mut self.gates.waiting[road as usize];
+                if !free || !has_room {
+                    if !held {
+                        waiting_here.front_mut().expect("somebody waits").held = true;
                         self.gates.held += 1;
                         continue;
                     }
                     break;
                 }
                 waiting_here.pop_front();
-                let id = self.arrived;
+                self.gates.pass(None, Some((zone, way.path)));
                 self.arrived += 1;
-                let mut car = Car::entering(id, path, now_s + after_s, speed_mps);
+                let mut car = Car::arriving(id, way, kind, now_s + after_s, speed_mps);
                 let held = Held::new(-speed_mps * after_s, speed_mps, 0.0);
                 car.x_m = held.position_m(dt_s);
                 self.scratch.entries.push(Entry { zone, car });
-                leader = Some(held);
+                leader = Some((held, kind));
             }
         }
         let waiting = &self.gates.waiting;
@@ -273,7 +303,7 @@ impl World {
 
     /// Moves everyone who stays in a zone to the end of the step.
     fn settle(&mut self, zone: usize, dt_s: f64) {
-        let (left, members) = self.cars[zone].split_at_mut(self.sites[zone].first());
+        let (left, members) = self.cars[zone].split_at_mut(self.zones[zone].first());
         let (left_motions, motions) = self.scratch.motions.split_at(left.len());
         for (car, held) in left.iter_mut().zip(left_motions) {
             car.move_on(held, dt_s);
@@ -309,44 +339,42 @@ impl World {
 
 fn note_entry_conditions(
     scenario: &Scenario,
-    lengths_m: &[f64],
-    car: &mut Car,
-    ahead: Option<&Car>,
-    previous: Option<&Car>,
+    own: &VehicleParams,
+    car: &Car,
+    owed: &[Owed],
+    cars: &[Car],
+    visit: &mut Visit,
 ) {
-    let (vehicle, control) = (&scenario.vehicle, &scenario.control);
-    let length = |path: u32| lengths_m[path as usize];
-    let own_length_m = length(car.path);
-    let pair = |x_m: f64, v_mps: f64, partner: &Car| Pair {
-        x_m,
-        v_mps,
-        partner_x_m: partner.x_m + own_length_m - length(partner.path),
-        partner_v_mps: partner.v_mps,
-        partner_u_mps2: partner.u_mps2,
-    };
-    let Visit { clean_rear_end, clean_merge, .. } = &mut car.visit;
-    if let Some(ahead) = ahead {
-        let rear_end = RearEnd {
-            reaction_s: vehicle.reaction_time_s,
-            gap_m: vehicle.standstill_gap_m,
-            k_per_s: control.k_rear_end_per_s,
-            u_min_mps2: vehicle.u_min_mps2,
+    let control = &scenario.control;
+    for Owed { duty, .. } in owed {
+        let other = &cars[duty.partner as usize];
+        let pair = Pair {
+            x_m: car.x_m,
+            v_mps: car.v_mps,
+            partner_x_m: other.x_m + duty.shift_m(),
+            partner_v_mps: other.v_mps,
+            partner_u_mps2: other.u_mps2,
         };
-        let pair = pair(car.x_m, car.v_mps, ahead);
-        *clean_rear_end = rear_end.margin_m(&pair) >= 0.0
-            && satisfiable_at(&rear_end.row(&pair), vehicle.u_min_mps2)
-            && rear_end.reserve_mps(&pair) >= 0.0;
-    }
-    if let Some(previous) = previous {
-        let merge = Merge {
-            reaction_per_length: vehicle.reaction_time_s / own_length_m,
-            gap_m: vehicle.standstill_gap_m,
-            k_per_s: control.k_merge_per_s,
-            u_min_mps2: vehicle.u_min_mps2,
-        };
-        let pair = pair(car.x_m, car.v_mps, previous);
-        *clean_merge = merge.margin_m(&pair) >= 0.0
-            && satisfiable_at(&merge.row(&pair), vehicle.u_min_mps2)
-            && merge.reserve_mps(&pair) >= 0.0;
+        match duty.in_force(car.x_m, other.x_m) {
+            None => {}
+            Some(DutyKind::RearEnd) => {
+                let rear_end = RearEnd {
+                    reaction_s: own.reaction_time_s,
+                    gap_m: duty.gap_m,
+                    k_per_s: control.k_rear_end_per_s,
+                    u_min_mps2: own.u_min_mps2,
+                };
+                visit.clean_rear_end &= rear_end.may_be_tracked(&pair);
+            }
+            Some(DutyKind::Merge | DutyKind::Cross) => {
+                let merge = Merge {
+                    reaction_per_length: own.reaction_time_s / duty.own_m,
+                    gap_m: duty.gap_m,
+                    k_per_s: control.k_merge_per_s,
+                    u_min_mps2: own.u_min_mps2,
+                };
+                visit.clean_merge &= merge.may_be_tracked(&pair);
+            }
+        }
     }
 }

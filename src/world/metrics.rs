@@ -19,6 +19,7 @@ pub(super) struct ZoneMetrics {
     pub least_rear_end_clean_m: f64,
     pub least_merge_m: f64,
     pub least_merge_clean_m: f64,
+    pub least_cross_m: f64,
     pub order_violations: u32,
     pub overtakes: u32,
 }
@@ -36,6 +37,7 @@ impl Default for ZoneMetrics {
             least_rear_end_clean_m: f64::INFINITY,
             least_merge_m: f64::INFINITY,
             least_merge_clean_m: f64::INFINITY,
+            least_cross_m: f64::INFINITY,
             order_violations: 0,
             overtakes: 0,
         }
@@ -43,8 +45,8 @@ impl Default for ZoneMetrics {
 }
 
 impl ZoneMetrics {
-    /// Accounts a vehicle that has passed the conflict point.
-    pub(super) fn leave(&mut self, visit: &Visit, time_s: f64, merge_margin_m: Option<f64>) {
+    /// Accounts a vehicle that has left the zone.
+    pub(super) fn leave(&mut self, visit: &Visit, time_s: f64) {
         self.vehicles += 1;
         self.time_s += time_s;
         self.energy += visit.energy;
@@ -54,20 +56,19 @@ impl ZoneMetrics {
         }
         self.infeasible_vehicles += u32::from(visit.infeasible);
         self.observe(visit);
-        if let Some(margin) = merge_margin_m {
-            self.least_merge_m = self.least_merge_m.min(margin);
-            if visit.clean_merge {
-                self.least_merge_clean_m = self.least_merge_clean_m.min(margin);
-            }
-        }
     }
 
-    /// Accounts the rear-end margin of a vehicle that leaves, or is still inside when the run ends.
+    /// Accounts the margins of a vehicle that leaves, or is still inside when the run ends.
     pub(super) fn observe(&mut self, visit: &Visit) {
         self.least_rear_end_m = self.least_rear_end_m.min(visit.least_rear_end_m);
         if visit.clean_rear_end {
             self.least_rear_end_clean_m = self.least_rear_end_clean_m.min(visit.least_rear_end_m);
         }
+        self.least_merge_m = self.least_merge_m.min(visit.least_merge_m);
+        if visit.clean_merge {
+            self.least_merge_clean_m = self.least_merge_clean_m.min(visit.least_merge_m);
+        }
+        self.least_cross_m = self.least_cross_m.min(visit.least_cross_m);
     }
 
     pub(super) fn row(&self, zone: &str, beta: f64) -> ZoneSummaryRow {
@@ -86,15 +87,17 @@ impl ZoneMetrics {
             infeasible_vehicles: self.infeasible_vehicles,
             min_rear_end_margin_m: seen(self.least_rear_end_m),
             min_merge_margin_m: seen(self.least_merge_m),
+            min_cross_margin_m: seen(self.least_cross_m),
             min_rear_end_margin_clean_m: seen(self.least_rear_end_clean_m),
             min_merge_margin_clean_m: seen(self.least_merge_clean_m),
             order_violations: self.order_violations,
             overtakes: self.overtakes,
+            orders_refused: 0,
         }
     }
 }
 
-/// One vehicle's passage through one zone, from origin to conflict point.
+/// One vehicle's passage through one zone, from origin to exit.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct CompletedVisit {
     /// The vehicle.
@@ -103,9 +106,9 @@ pub struct CompletedVisit {
     pub zone: u32,
     /// Instant of entry, s.
     pub entry_time_s: f64,
-    /// Instant at which it passed the conflict point, s.
+    /// Instant at which it left, s.
     pub exit_time_s: f64,
-    /// Speed at the conflict point, m/s.
+    /// Speed at which it left, m/s.
     pub exit_speed_mps: f64,
     /// Energy, the integral of u^2/2, m^2/s^3.
     pub energy: f64,
@@ -143,14 +146,18 @@ pub struct ZoneSummaryRow {
     pub min_rear_end_margin_m: Option<f64>,
     /// Least merging margin of any vehicle at its crossing, m; absent when none was needed.
     pub min_merge_margin_m: Option<f64>,
+    /// Least crossing margin of any vehicle at its crossing, m; absent when none was needed.
+    pub min_cross_margin_m: Option<f64>,
     /// The same for vehicles whose rear-end entry conditions held when they entered.
     pub min_rear_end_margin_clean_m: Option<f64>,
     /// The same for vehicles whose merging entry conditions held when they entered.
     pub min_merge_margin_clean_m: Option<f64>,
-    /// Vehicles that passed the conflict point before one that entered earlier.
+    /// Times a vehicle passed a conflict point before one that was to pass it first.
     pub order_violations: u32,
     /// Samples at which a vehicle was ahead of its leader.
     pub overtakes: u32,
+    /// Passing orders of the coordinator that the world did not adopt, as they would have put somebody in danger.
+    pub orders_refused: u32,
 }
 
 /// Results of a run as far as the world knows them.
@@ -226,14 +233,18 @@ pub struct ShieldRow {
     pub rear_end: u64,
     /// Commands bounded by the merging margin.
     pub merge: u64,
+    /// Commands bounded by the crossing margin.
+    pub cross: u64,
     /// Times a vehicle was not safe toward a partner when it came to owe it something: not guaranteed.
     pub began_unsafe: u32,
     /// Vehicle-steps that ended unsafe although they were guaranteed; 0 with the shield on.
     pub lost: u32,
     /// Least rear-end margin of guaranteed vehicles at any instant, m.
     pub min_rear_end_margin_m: Option<f64>,
-    /// Least merging margin of guaranteed vehicles from their crossing on, m.
+    /// Least merging margin of guaranteed vehicles from the merge on, m.
     pub min_merge_margin_m: Option<f64>,
+    /// Least crossing margin of guaranteed vehicles, m.
+    pub min_cross_margin_m: Option<f64>,
 }
 
 impl ShieldRow {

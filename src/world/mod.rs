@@ -7,10 +7,14 @@ mod gate;
 mod gateway;
 mod integrate;
 mod link;
+#[cfg(test)]
+mod merge_hashes;
 mod metrics;
 mod overlap;
+mod owed;
 mod role;
 mod standstill;
+mod way;
 
 pub use change::ChangeError;
 pub use gateway::CommandFault;

@@ -1,15 +1,16 @@
 //! Bodies that overlap: an observer of its own, on which nobody's motion depends.
 //!
 //! A vehicle's position is that of its front; its body reaches back from there by its length, along the way it
-//! has come. Two bodies overlap where they are on one way: on one approach or link, in one and the next place
-//! of it, or, of different approaches, from the instant on at which both fronts are past the conflict point.
-//! Each instant counts, between samples as well as at them. Outside the network nobody is looked at but
+//! has come. Two bodies overlap where they are on one way: on a stretch that their paths share, from the instant on at
+//! which both fronts are on it, or on one link. Where paths cross, two bodies overlap that are in the conflict
+//! area at once. Each instant counts, between samples as well as at them. Outside the network nobody is looked at but
 //! vehicles that have just left, for the sake of those behind them.
 
 use super::car::Car;
 use super::role::World;
 use crate::lanes::Lanes;
-use crate::scenario::{Exit, Scenario, ZoneId};
+use crate::conflict::{Conflicts, PointKind, Run};
+use crate::scenario::{Scenario, VehicleParams};
 use crate::vehicle::Held;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
@@ -48,27 +49,31 @@ pub struct FirstOverlap {
 pub(super) struct Overlaps {
     summary: OverlapSummary,
     pairs: BTreeSet<[u32; 2]>,
-    /// Vehicles whose bodies still reach back into a zone that others have left after them: like index 0,
-    /// in the zone's coordinate.
-    tails: Lanes<Tail>,
-    /// Least position of those seen so far on each approach of a zone, m.
+    /// Vehicles whose bodies still reach back into a zone in which others count as the last that left: in the
+    /// zone's coordinate.
+    tails: Lanes<Car>,
+    /// Least position of those seen so far from each entrance of a zone, m.
     least_m: Vec<f64>,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct Tail {
-    car: Car,
-    /// The last zone it is known to have left.
-    left_from: ZoneId,
+    /// Stretches that two vehicles share; kept for its allocation.
+    runs: Vec<Run>,
 }
 
 /// A step as overlaps are looked for in it.
 #[derive(Clone, Copy)]
 struct Look<'a> {
     scenario: &'a Scenario,
+    kinds: &'a [VehicleParams],
     zone: usize,
     step: u64,
     dt_s: f64,
+}
+
+/// A vehicle and its motion over the step.
+#[derive(Clone, Copy)]
+struct Body<'a> {
+    vehicle: u32,
+    length_m: f64,
+    motion: &'a Held,
 }
 
 impl Overlaps {
@@ -78,6 +83,7 @@ impl Overlaps {
             pairs: BTreeSet::new(),
             tails: Lanes::new(zones),
             least_m: Vec::new(),
+            runs: Vec::new(),
         }
     }
 
@@ -85,38 +91,40 @@ impl Overlaps {
         self.summary.clone()
     }
 
-    /// Keeps a vehicle that has left a zone after another, or is passed over by one, while its body still
-    /// reaches back.
-    pub(super) fn keep_tail(
-        &mut self,
-        zone: usize,
-        car: Car,
-        left_from: ZoneId,
-        conflict_m: f64,
-        body_m: f64,
-    ) {
-        if car.x_m - body_m < conflict_m {
-            self.tails.push(zone, Tail { car, left_from });
+    /// Keeps a vehicle that no longer counts in a zone while its body still reaches back to it.
+    pub(super) fn keep_tail(&mut self, zone: usize, car: Car, clear_from_m: f64) {
+        if car.x_m < clear_from_m {
+            self.tails.push(zone, car);
         }
     }
 
-    /// Compares two vehicles from an instant of the step on.
-    fn compare(&mut self, look: Look<'_>, a: (u32, &Held), b: (u32, &Held), shift_m: f64, from_s: f64) {
-        let body_m = look.scenario.vehicle.length_m - TOLERANCE_M;
-        let (a_to_m, b_to_m) = (a.1.position_m(look.dt_s), b.1.position_m(look.dt_s) + shift_m);
-        if b.1.x0_m + shift_m - body_m >= a_to_m || a.1.x0_m - body_m >= b_to_m {
+    /// Compares two vehicles on one way from an instant of the step on; `shift_m` expresses the second's position in
+    /// the first's coordinate.
+    fn compare(&mut self, look: Look<'_>, a: Body<'_>, b: Body<'_>, shift_m: f64, from_s: f64) {
+        // What counts is the body of the one ahead.
+        let b_leads = b.motion.position_m(from_s) + shift_m >= a.motion.position_m(from_s);
+        let whole_m = if b_leads { b.length_m } else { a.length_m };
+        let body_m = whole_m - TOLERANCE_M;
+        let (a_to_m, b_to_m) =
+            (a.motion.position_m(look.dt_s), b.motion.position_m(look.dt_s) + shift_m);
+        if b.motion.x0_m + shift_m - body_m >= a_to_m || a.motion.x0_m - body_m >= b_to_m {
             return;
         }
-        let (time_s, least_m) = a.1.time_within(b.1, shift_m, body_m, (from_s, look.dt_s));
+        let (time_s, least_m) = a.motion.time_within(b.motion, shift_m, body_m, (from_s, look.dt_s));
         if least_m >= body_m {
             return;
         }
-        let pair = [a.0.min(b.0), a.0.max(b.0)];
+        let apart_m = b.motion.x0_m + shift_m - a.motion.x0_m;
+        let at_sample = from_s == 0.0 && apart_m.abs() < body_m;
+        self.note(look, [a.vehicle, b.vehicle], time_s, whole_m - least_m, at_sample);
+    }
+
+    fn note(&mut self, look: Look<'_>, [a, b]: [u32; 2], time_s: f64, depth_m: f64, at_sample: bool) {
+        let pair = [a.min(b), a.max(b)];
         let seen = &mut self.summary;
         seen.time_s += time_s;
-        seen.deepest_m = seen.deepest_m.max(look.scenario.vehicle.length_m - least_m);
-        let apart_m = b.1.x0_m + shift_m - a.1.x0_m;
-        seen.samples += u64::from(from_s == 0.0 && apart_m.abs() < body_m);
+        seen.deepest_m = seen.deepest_m.max(depth_m);
+        seen.samples += u64::from(at_sample);
         if self.pairs.insert(pair) {
             seen.pairs += 1;
             seen.first.get_or_insert_with(|| FirstOverlap {
@@ -128,159 +136,97 @@ impl Overlaps {
     }
 }
 
+/// When a body is between two places within the step, s; `from > to` when it is not.
+fn time_between(motion: &Held, from_m: f64, to_m: f64, dt_s: f64) -> (f64, f64) {
+    let from_s = motion.passes_m(from_m, dt_s).unwrap_or(f64::INFINITY);
+    // Whoever stands at the end is out.
+    let to_s = if motion.x0_m >= to_m { 0.0 } else { motion.passes_m(to_m, dt_s).unwrap_or(dt_s) };
+    (from_s, to_s)
+}
+
 impl World {
-    /// Looks at a zone's vehicles over the step, before those that cross are taken out; everybody's motion is
-    /// settled, and nobody downstream has moved.
-    pub(super) fn observe_overlaps(&mut self, scenario: &Scenario, zone: usize, dt_s: f64, crosses: bool) {
-        let look = Look { scenario, zone, step: self.step, dt_s };
+    /// Looks at a zone's vehicles over the step, before those that leave are taken out; everybody's motion is
+    /// settled.
+    pub(super) fn observe_overlaps(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) {
         let has_tails = self.overlaps.tails.total() > 0 && !self.overlaps.tails[zone].is_empty();
         if has_tails {
             self.follow_tails(scenario, zone);
         }
-        let body_m = scenario.vehicle.length_m;
-        let Overlaps { least_m, tails, .. } = &mut self.overlaps;
+        let look = Look { scenario, kinds: &self.kinds, zone, step: self.step, dt_s };
+        let paths = &scenario.network.zones[zone].paths;
+        let entrance = |car: &Car| paths[car.path as usize].segments[0];
+        let longest_m = self.longest_m;
+        let least_m = &mut self.overlaps.least_m;
         least_m.clear();
-        least_m.resize(self.lengths_m[zone].len(), f64::INFINITY);
-        for Tail { car, .. } in if has_tails { &tails[zone] } else { &[] } {
-            let least_m = &mut least_m[car.path as usize];
+        least_m.resize(scenario.network.zones[zone].segments.len(), f64::INFINITY);
+        for car in if has_tails { &self.overlaps.tails[zone] } else { &[] } {
+            let least_m = &mut least_m[entrance(car) as usize];
             *least_m = least_m.min(car.x_m);
         }
-        let first = self.sites[zone].first();
-        let cars = &self.cars[zone];
-        for (i, (car, motion)) in cars.iter().zip(&self.scratch.motions).enumerate() {
-            let least_m = &mut self.overlaps.least_m[car.path as usize];
-            let is_near = i >= first && *least_m - body_m < motion.position_m(dt_s);
+        let first = self.zones[zone].first();
+        let (cars, motions, conflicts) = (&self.cars[zone], &self.scratch.motions, &self.conflicts[zone]);
+        for (i, (car, motion)) in cars.iter().zip(motions).enumerate() {
+            let least_m = &mut self.overlaps.least_m[entrance(car) as usize];
+            let to_m = motion.position_m(dt_s);
+            let is_near = *least_m - longest_m < to_m;
             *least_m = least_m.min(car.x_m);
-            if !is_near {
+            let meets = to_m >= conflicts.meets_from_m(car.path);
+            if i < first || !(is_near || meets) {
                 continue;
             }
-            let own = (car.vehicle, motion);
-            for (other, at) in cars[..i].iter().zip(&self.scratch.motions).filter(|(o, _)| o.path == car.path)
-            {
-                self.overlaps.compare(look, own, (other.vehicle, at), 0.0, 0.0);
+            // On its own lane it is compared with those near it, elsewhere with those that are where paths meet.
+            let concerns = |other: &Car, at: &Held| match entrance(other) == entrance(car) {
+                true => is_near,
+                false => meets && at.position_m(dt_s) >= conflicts.meets_from_m(other.path),
+            };
+            for (other, at) in cars[..i].iter().zip(motions) {
+                if concerns(other, at) {
+                    compare_in_zone(&mut self.overlaps, look, conflicts, (car, motion), (other, at));
+                }
             }
             for at in 0..if has_tails { self.overlaps.tails[zone].len() } else { 0 } {
-                let tail = self.overlaps.tails[zone][at].car;
-                if tail.path == car.path {
-                    self.overlaps.compare(look, own, (tail.vehicle, &tail.held()), 0.0, 0.0);
+                let other = self.overlaps.tails[zone][at];
+                let held = other.held();
+                if concerns(&other, &held) {
+                    compare_in_zone(&mut self.overlaps, look, conflicts, (car, motion), (&other, &held));
                 }
             }
-        }
-        if crosses {
-            self.observe_crossing(look);
         }
         if has_tails {
-            self.move_tails(look);
+            self.move_tails(zone, dt_s);
         }
     }
 
-    /// Looks at those that pass the conflict point, from then on: at each other, and at who is ahead there.
-    fn observe_crossing(&mut self, look: Look<'_>) {
-        let Look { scenario, zone, dt_s, .. } = look;
-        let exit = self.sites[zone].exit;
-        if let Exit::Zone { zone: down, .. } = exit {
-            // Its own turn has not come yet.
-            if self.sites[down as usize].has_left {
-                self.hold_left(scenario, down as usize);
-            }
-            self.follow_tails(scenario, down as usize);
-        }
-        let first = self.sites[zone].first();
-        for i in first..self.cars[zone].len() {
-            let (car, motion) = (self.cars[zone][i], self.scratch.motions[i]);
-            let conflict_m = self.lengths_m[zone][car.path as usize];
-            let Some(after_s) = motion.passes_m(conflict_m, dt_s) else { continue };
-            let own = (car.vehicle, &motion);
-            // Vehicles of its own approach it has been compared with already.
-            for j in first..i {
-                let (other, at) = (self.cars[zone][j], self.scratch.motions[j]);
-                let other_m = self.lengths_m[zone][other.path as usize];
-                if other.path != car.path
-                    && let Some(other_after_s) = at.passes_m(other_m, dt_s)
-                {
-                    let from_s = after_s.max(other_after_s);
-                    self.overlaps.compare(look, own, (other.vehicle, &at), conflict_m - other_m, from_s);
-                }
-            }
-            match exit {
-                Exit::Out => {
-                    for at in 0..first + self.overlaps.tails[zone].len() {
-                        let other = self.left_at(zone, at);
-                        if other.path == car.path {
-                            continue;
-                        }
-                        let shift_m = conflict_m - self.lengths_m[zone][other.path as usize];
-                        self.overlaps.compare(look, own, (other.vehicle, &other.held()), shift_m, after_s);
-                    }
-                }
-                Exit::Zone { zone: down, path, link_m, .. } => {
-                    for link_car in &self.links[zone].cars {
-                        if !self.has_left_on(zone, car.path, link_car.car.vehicle) {
-                            let other = (link_car.car.vehicle, &link_car.held);
-                            self.overlaps.compare(look, own, other, conflict_m, after_s);
-                        }
-                    }
-                    for at in 0..self.ahead_count(down as usize) {
-                        let other = self.ahead_at(down as usize, at);
-                        if other.path == path && !self.has_left_on(zone, car.path, other.vehicle) {
-                            let other = (other.vehicle, &other.held());
-                            self.overlaps.compare(look, own, other, conflict_m + link_m, after_s);
-                        }
-                    }
-                }
-            }
-        }
-    }
-
-    /// One of the vehicles that have left a zone and are still looked at there.
-    fn left_at(&self, zone: usize, at: usize) -> Car {
-        let first = self.sites[zone].first();
-        if at < first { self.cars[zone][at] } else { self.overlaps.tails[zone][at - first].car }
-    }
-
-    /// Vehicles of a zone, and those that have left it and are still looked at there.
-    fn ahead_count(&self, zone: usize) -> usize {
-        self.cars[zone].len() + self.overlaps.tails[zone].len()
-    }
-
-    fn ahead_at(&self, zone: usize, at: usize) -> Car {
-        let cars = &self.cars[zone];
-        if at < cars.len() { cars[at] } else { self.overlaps.tails[zone][at - cars.len()].car }
-    }
-
-    /// Whether a vehicle has left a zone on this path and is still looked at there.
-    fn has_left_on(&self, zone: usize, path: u32, vehicle: u32) -> bool {
-        (0..self.sites[zone].first() + self.overlaps.tails[zone].len())
-            .map(|at| self.left_at(zone, at))
-            .any(|left| left.vehicle == vehicle && left.path == path)
-    }
-
-    /// Looks at the vehicles on the link behind a zone, and at those that have just left it.
-    pub(super) fn observe_link_overlaps(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) {
-        let Exit::Zone { zone: down, path, link_m, .. } = self.sites[zone].exit else { return };
-        let look = Look { scenario, zone, step: self.step, dt_s };
-        let body_m = scenario.vehicle.length_m;
-        if self.links[zone].cars.is_empty() {
+    /// Looks at the vehicles on a link, and at those that have just left it.
+    pub(super) fn observe_link_overlaps(&mut self, scenario: &Scenario, link: usize, dt_s: f64) {
+        if self.links.all[link].cars.is_empty() {
             return;
         }
-        self.follow_tails(scenario, down as usize);
-        let cars = &self.links[zone].cars;
+        let (from, to) = (self.links.all[link].from.0 as usize, self.links.all[link].to);
+        let down = to.zone as usize;
+        self.follow_tails(scenario, down);
+        let look = Look { scenario, kinds: &self.kinds, zone: from, step: self.step, dt_s };
+        let paths = &scenario.network.zones[down].paths;
+        let cars = &self.links.all[link].cars;
         let mut least_m = f64::INFINITY;
         for (i, link_car) in cars.iter().enumerate() {
-            let own = (link_car.car.vehicle, &link_car.held);
+            let own = look.body(&link_car.car, &link_car.held);
             let to_m = link_car.held.position_m(dt_s);
-            if least_m - body_m < to_m {
+            if least_m - self.longest_m < to_m {
                 for other in &cars[..i] {
-                    self.overlaps.compare(look, own, (other.car.vehicle, &other.held), 0.0, 0.0);
+                    self.overlaps.compare(look, own, look.body(&other.car, &other.held), 0.0, 0.0);
                 }
             }
             least_m = least_m.min(link_car.car.x_m);
-            if to_m > link_m - body_m {
-                for at in 0..self.ahead_count(down as usize) {
-                    let other = self.ahead_at(down as usize, at);
-                    if other.path == path {
-                        self.overlaps.compare(look, own, (other.vehicle, &other.held()), link_m, 0.0);
-                    }
+            if to_m <= to.link_m - self.longest_m {
+                continue;
+            }
+            let count = self.cars[down].len();
+            for at in 0..count + self.overlaps.tails[down].len() {
+                let other = if at < count { self.cars[down][at] } else { self.overlaps.tails[down][at - count] };
+                if paths[other.path as usize].segments[0] == to.segment {
+                    let held = other.held();
+                    self.overlaps.compare(look, own, look.body(&other, &held), to.link_m, 0.0);
                 }
             }
         }
@@ -289,28 +235,75 @@ impl World {
     /// Settles what the tails of a zone hold over the step: what their vehicles do elsewhere.
     fn follow_tails(&mut self, scenario: &Scenario, zone: usize) {
         for at in 0..self.overlaps.tails[zone].len() {
-            let Tail { car, mut left_from } = self.overlaps.tails[zone][at];
-            let u = self.left_mps2(scenario, zone, &mut left_from, &car);
-            let tail = &mut self.overlaps.tails[zone][at];
-            tail.left_from = left_from;
-            tail.car.command_mps2 = u;
+            let mut car = self.overlaps.tails[zone][at];
+            car.command_mps2 = self.follow(scenario, zone, &mut car).u_mps2;
+            self.overlaps.tails[zone][at] = car;
         }
     }
 
     /// Moves the tails of a zone to the end of the step; those that have left it altogether are forgotten.
-    fn move_tails(&mut self, look: Look<'_>) {
-        let lengths_m = &self.lengths_m[look.zone];
-        let tails = &mut self.overlaps.tails[look.zone];
+    fn move_tails(&mut self, zone: usize, dt_s: f64) {
+        let lengths_m = &self.lengths_m[zone];
+        let tails = &mut self.overlaps.tails[zone];
         let mut kept = 0;
         for at in 0..tails.len() {
-            let mut tail = tails[at];
-            let held = tail.car.held();
-            tail.car.move_on(&held, look.dt_s);
-            if tail.car.x_m - look.scenario.vehicle.length_m < lengths_m[tail.car.path as usize] {
-                tails[kept] = tail;
+            let mut car = tails[at];
+            let held = car.held();
+            car.move_on(&held, dt_s);
+            let length_m = self.kinds[usize::from(car.kind)].length_m;
+            if car.x_m - length_m < lengths_m[car.path as usize] {
+                tails[kept] = car;
                 kept += 1;
             }
         }
-        self.overlaps.tails.truncate(look.zone, kept);
+        self.overlaps.tails.truncate(zone, kept);
+    }
+}
+
+impl Look<'_> {
+    fn body<'a>(&self, car: &Car, motion: &'a Held) -> Body<'a> {
+        Body { vehicle: car.vehicle, length_m: self.kinds[usize::from(car.kind)].length_m, motion }
+    }
+}
+
+/// Compares two vehicles of a zone wherever their paths meet.
+fn compare_in_zone(
+    overlaps: &mut Overlaps,
+    look: Look<'_>,
+    conflicts: &Conflicts,
+    (car, motion): (&Car, &Held),
+    (other, at): (&Car, &Held),
+) {
+    let (own, theirs) = (look.body(car, motion), look.body(other, at));
+    let mut runs = std::mem::take(&mut overlaps.runs);
+    runs.clear();
+    conflicts.runs((car.path, car.next_path), (other.path, other.next_path), |run| runs.push(run));
+    for run in &runs {
+        // From the entrance on, and before it, for a rounding.
+        let enters_s = |held: &Held, from_m: f64| match run.from_m == 0.0 {
+            true => Some(0.0),
+            false => held.passes_m(from_m, look.dt_s),
+        };
+        let entered = enters_s(motion, run.from_m).zip(enters_s(at, run.other_from_m));
+        let shift_m = run.from_m - run.other_from_m;
+        // Where they have parted, both are past the end.
+        if let Some((own_s, other_s)) = entered.filter(|_| car.x_m.min(other.x_m + shift_m) < run.to_m) {
+            overlaps.compare(look, own, theirs, shift_m, own_s.max(other_s));
+        }
+    }
+    overlaps.runs = runs;
+    for here in conflicts.uses(car.path) {
+        let point = &conflicts.points()[here.point as usize];
+        let there = conflicts.uses(other.path).iter().find(|u| u.point == here.point && !u.on_lane_of(here));
+        let (PointKind::Crossing, Some(there)) = (point.kind, there) else { continue };
+        let inside = |body: &Body<'_>, from_m: f64| {
+            time_between(body.motion, from_m, from_m + point.area_m + body.length_m, look.dt_s)
+        };
+        let (own_in, other_in) = (inside(&own, here.at_m), inside(&theirs, there.at_m));
+        let (from_s, to_s) = (own_in.0.max(other_in.0), own_in.1.min(other_in.1));
+        if to_s - from_s > TOLERANCE_M {
+            let depth_m = own.length_m.min(theirs.length_m);
+            overlaps.note(look, [own.vehicle, theirs.vehicle], to_s - from_s, depth_m, from_s == 0.0);
+        }
     }
 }

@@ -5,16 +5,19 @@ use super::faults::Faults;
 use super::gate::Gates;
 use super::gateway::Gateway;
 use super::integrate::{Entry, Leader};
-use super::link::Link;
-use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics};
+use super::link::Links;
+use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics, ZoneSummaryRow};
 use super::overlap::Overlaps;
+use super::owed::{Order, Owed};
 use super::standstill::Standstills;
+use crate::conflict::Conflicts;
 use crate::lanes::{AHEAD, Lanes};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
-use crate::scenario::{Exit, Scenario, ZoneId};
+use crate::scenario::{Scenario, VehicleParams, ZoneId};
 use crate::vehicle::Held;
 use either::Either;
 use ipc_schemas::{self as frames, VehicleState};
+use std::collections::HashMap;
 use std::ops::Range;
 use std::sync::Arc;
 use xxhash_rust::xxh3::{Xxh3, xxh3_64_with_seed};
@@ -27,17 +30,29 @@ use xxhash_rust::xxh3::{Xxh3, xxh3_64_with_seed};
 pub struct World {
     pub(super) scenario: Arc<Scenario>,
     pub(super) step: u64,
-    /// The paper's S(t) of each zone: index 0, where there is one (see [`Site`]), and the members in order
-    /// of entry.
+    /// The paper's S(t) of each zone: those that left last (see [`ZoneState`]), and the members in order of
+    /// entry.
     pub(super) cars: Lanes<Car>,
-    pub(super) sites: Vec<Site>,
-    /// Zones that have an index 0.
-    pub(super) with_left: usize,
-    /// Lengths of each zone's approaches, m.
+    pub(super) zones: Vec<ZoneState>,
+    /// Those that left last, of all zones.
+    pub(super) left: usize,
+    pub(super) conflicts: Vec<Conflicts>,
+    /// Lengths of each zone's paths, m.
     pub(super) lengths_m: Lanes<f64>,
-    /// The link behind each zone's exit; never used when the length is 0.
-    pub(super) links: Vec<Link>,
-    pub(super) on_links: usize,
+    /// The duties of each zone's members, car by car, and the order in which members pass: indices of cars.
+    pub(super) owed: Lanes<Owed>,
+    pub(super) order: Lanes<u32>,
+    /// Of zones that are not served in order of entry.
+    pub(super) orders: HashMap<ZoneId, Order>,
+    pub(super) links: Links,
+    /// Parameters by kind of vehicle.
+    pub(super) kinds: Vec<VehicleParams>,
+    /// The greatest distance `phi v` any of them keeps, m.
+    pub(super) reach_m: f64,
+    /// The greatest length of any of them, m.
+    pub(super) longest_m: f64,
+    /// Whether some exit leads to a zone that does not come later.
+    pub(super) closes_a_circle: bool,
     pub(super) gates: Gates,
     pub(super) arrived: u32,
     pub(super) departed: u32,
@@ -64,21 +79,19 @@ pub struct World {
 }
 
 /// What there is to know of a zone beside its vehicles.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Site {
-    pub exit: Exit,
-    /// Whether the first of the zone's cars is index 0 of the paper's S(t): the vehicle that left last.
-    pub has_left: bool,
-    /// It left during the step just ended.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct ZoneState {
+    /// How many of the zone's cars have left it: index 0 of the paper's S(t), by each exit and toward each path
+    /// behind it the one that left last, and whoever is not yet clear of a crossing.
+    pub left: u32,
+    /// Somebody left during the step just ended.
     pub left_now: bool,
-    /// The last zone it is known to have left.
-    pub left_from: ZoneId,
 }
 
-impl Site {
+impl ZoneState {
     /// Place of the first member among the zone's cars.
     pub(super) fn first(&self) -> usize {
-        usize::from(self.has_left)
+        self.left as usize
     }
 }
 
@@ -94,6 +107,14 @@ pub(super) struct Scratch {
     pub entries: Vec<Entry>,
     /// What newcomers on a road find ahead of them.
     pub leaders: Vec<Leader>,
+    /// A zone's cars and their motions while they are put together anew.
+    pub cars: Vec<Car>,
+    pub moved: Vec<Held>,
+    /// Those that leave a zone, with the instant within the step, s, and their motion.
+    pub leaving: Vec<(f64, Car, Held)>,
+    /// Those that have left a zone and whose motion is assumed until it is known: zone and place.
+    pub assumed: Vec<(ZoneId, usize)>,
+    pub duties: super::owed::Deriving,
 }
 
 /// Where the records of a state frame are written, in order.
@@ -125,28 +146,27 @@ impl World {
             .collect();
         let (mut lengths_m, mut neighbours) = (Lanes::new(zones), Lanes::new(zones));
         for (i, zone) in network.zones.iter().enumerate() {
-            zone.approaches.iter().for_each(|a| lengths_m.push(i, a.length_m));
+            zone.paths.iter().for_each(|path| lengths_m.push(i, path.length_m));
             network.neighbours(i as ZoneId).for_each(|n| neighbours.push(i, n));
         }
-        let links = network
-            .zones
-            .iter()
-            .map(|z| match z.exit {
-                Exit::Zone { link_m, link_speed_mps, .. } => {
-                    Link { length_m: link_m, speed_mps: link_speed_mps, cars: Vec::new() }
-                }
-                Exit::Out => Link::default(),
-            })
-            .collect();
-        let site = |exit| Site { exit, has_left: false, left_now: false, left_from: 0 };
+        let kinds: Vec<VehicleParams> = scenario.fleet.iter().map(|kind| kind.vehicle).collect();
         World {
             step: 0,
             cars: Lanes::new(zones),
-            sites: network.zones.iter().map(|z| site(z.exit)).collect(),
-            with_left: 0,
+            zones: vec![ZoneState::default(); zones],
+            left: 0,
+            conflicts: Conflicts::of_all(network),
             lengths_m,
-            links,
-            on_links: 0,
+            owed: Lanes::new(zones),
+            order: Lanes::new(zones),
+            orders: HashMap::new(),
+            links: Links::of(network),
+            reach_m: kinds.iter().map(|k| k.reaction_time_s * k.v_max_mps).fold(0.0, f64::max),
+            longest_m: kinds.iter().map(|k| k.length_m).fold(0.0, f64::max),
+            kinds,
+            closes_a_circle: (0..)
+                .zip(&network.zones)
+                .any(|(zone, shape)| shape.exits.iter().filter_map(|exit| exit.to).any(|to| to.zone <= zone)),
             gates: Gates::new(&scenario),
             arrived: 0,
             departed: 0,
@@ -187,17 +207,17 @@ impl World {
     /// Whether the run is over: all demand served, or out of time.
     pub fn is_finished(&self) -> bool {
         self.scenario.time_s(self.step) >= self.scenario.max_time_s
-            || (self.gates.exhausted() && self.on_links == 0 && self.member_count() == 0)
+            || (self.gates.exhausted() && self.links.cars == 0 && self.member_count() == 0)
     }
 
     /// Vehicles in zones.
     fn member_count(&self) -> usize {
-        self.cars.total() - self.with_left
+        self.cars.total() - self.left
     }
 
     /// The members of a zone in order of entry.
     pub(super) fn members(&self, zone: usize) -> &[Car] {
-        &self.cars[zone][self.sites[zone].first()..]
+        &self.cars[zone][self.zones[zone].first()..]
     }
 
     /// Keeps every visit completed from now on; nobody's motion or hash depends on it.
@@ -222,7 +242,7 @@ impl World {
 
     /// The number of records of the present state frame.
     pub fn record_count(&self) -> usize {
-        self.cars.total() + self.on_links
+        self.cars.total() + self.links.cars
     }
 
     /// The number of records of the frame for a coordinator process.
@@ -259,21 +279,29 @@ impl World {
     }
 
     fn true_records(&self) -> impl Iterator<Item = VehicleState> + '_ {
-        (0..self.sites.len() as ZoneId).flat_map(|z| self.zone_records(z)).chain(self.link_records())
+        (0..self.zones.len() as ZoneId).flat_map(|z| self.zone_records(z)).chain(self.link_records())
     }
 
     fn link_records(&self) -> impl Iterator<Item = VehicleState> + '_ {
         // Most networks have no links: an empty range spares the walk over them.
-        let links = if self.on_links == 0 { &[][..] } else { &self.links[..] };
-        links.iter().flat_map(|link| &link.cars).map(|c| self.record(&c.car, frames::NO_ZONE, 0))
+        let links = if self.links.cars == 0 { &[][..] } else { &self.links.all[..] };
+        links.iter().zip(0..).flat_map(move |(link, index)| {
+            link.cars.iter().map(move |c| VehicleState {
+                next_zone: link.to.zone,
+                next_path: c.car.path,
+                then_path: c.car.next_path,
+                link: index,
+                ..self.record(&c.car, frames::NO_ZONE, 0)
+            })
+        })
     }
 
     /// A zone's S(t).
     fn zone_records(&self, zone: ZoneId) -> impl Iterator<Item = VehicleState> + '_ {
         self.cars.fetch(zone as usize + AHEAD);
-        let site = &self.sites[zone as usize];
-        let left_flags = frames::STATE_LEFT | if site.left_now { frames::STATE_LEFT_NOW } else { 0 };
-        let (left, members) = self.cars[zone as usize].split_at(site.first());
+        let state = &self.zones[zone as usize];
+        let left_flags = frames::STATE_LEFT | if state.left_now { frames::STATE_LEFT_NOW } else { 0 };
+        let (left, members) = self.cars[zone as usize].split_at(state.first());
         let members = members
             .iter()
             .map(move |c| self.record(c, zone, if c.visit.entered { frames::STATE_ENTERED } else { 0 }));
@@ -289,11 +317,15 @@ impl World {
             entry_speed_mps: car.entry_speed_mps,
             planned_exit_time_s: car.planned_exit_time_s,
             planned_exit_speed_mps: car.planned_exit_speed_mps,
-            length_m: self.scenario.vehicle.length_m,
+            length_m: self.kinds[usize::from(car.kind)].length_m,
             vehicle: car.vehicle,
             zone,
             path: car.path,
-            kind: frames::KIND_CAV,
+            next_zone: car.next_zone,
+            next_path: car.next_path,
+            then_path: car.then_path,
+            link: frames::NO_LINK,
+            kind: car.kind,
             flags,
         }
     }
@@ -308,7 +340,7 @@ impl World {
         }
         let mut hash = Xxh3::with_seed(self.state_hash);
         let mut hashed = 0;
-        for zone in 0..self.sites.len() {
+        for zone in 0..self.zones.len() {
             self.zone_records(zone as ZoneId).for_each(|record| sheet.push(record));
             let new = &sheet.written()[hashed..];
             if new.len() >= BATCH {
@@ -401,7 +433,8 @@ impl World {
                 .map(|(i, (zone, metrics))| {
                     let mut metrics = metrics.clone();
                     self.members(i).iter().for_each(|car| metrics.observe(&car.visit));
-                    metrics.row(&zone.name, self.scenario.beta)
+                    let row = metrics.row(&zone.name, self.scenario.beta);
+                    ZoneSummaryRow { orders_refused: self.refused_orders(i), ..row }
                 })
                 .collect(),
         }

@@ -6,8 +6,14 @@ use std::path::PathBuf;
 
 #[derive(Debug, Args)]
 pub(in crate::app) struct ShowArgs {
-    /// The recording.
+    /// The recording; with --network, the scenario: a file, or the name of an embedded one.
     pub file: PathBuf,
+    /// Draw the network of a scenario instead.
+    #[arg(long, conflicts_with_all = ["step", "vehicle", "scenario", "json"])]
+    pub network: bool,
+    /// Where to draw it: a file that ends in .svg or .png [default: NAME.svg].
+    #[arg(long, value_name = "FILE", requires = "network")]
+    pub out: Option<PathBuf>,
     /// Show one step: states, assignments and commands.
     #[arg(long, value_name = "K", conflicts_with = "vehicle")]
     pub step: Option<u64>,

@@ -2,7 +2,9 @@
 
 use super::error::{Place, ScenarioError, nearest};
 use super::table::{Field, Table};
-use crate::scenario::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution, VehicleParams, ranges};
+use crate::scenario::{
+    Arrival, Demand, Poisson, RatePeriod, Route, SpeedDistribution, VehicleParams, ranges,
+};
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::rc::Rc;
@@ -12,6 +14,8 @@ pub(in crate::scenario) const MAX_TIME_S: f64 = 1e9;
 /// 10 vehicles per second: no lane carries it, and it bounds the work per simulated second.
 pub(in crate::scenario) const MAX_RATE_PER_HOUR: f64 = 36_000.0;
 const HEADER: &str = "time_s,road,speed_mps";
+/// A trace may say which of its road's routes a vehicle takes.
+const HEADER_WITH_ROUTES: &str = "time_s,road,speed_mps,route";
 
 /// Where the traces a scenario names are found.
 pub(super) enum TraceBase {
@@ -28,6 +32,8 @@ pub(super) struct DemandReader<'a> {
     pub(super) base: TraceBase,
     pub(super) seed: u64,
     pub(super) roads: Vec<&'a str>,
+    /// The routes of each road.
+    pub(super) routes: Vec<Vec<Route>>,
     pub(super) vehicle: VehicleParams,
     pub(super) traces: BTreeMap<String, Rc<Vec<(u32, Arrival)>>>,
 }
@@ -189,7 +195,7 @@ impl DemandReader<'_> {
         let mut reader = csv::ReaderBuilder::new().has_headers(false).flexible(true).from_reader(bytes);
         let mut record = csv::StringRecord::new();
         let mut rows: Vec<(u32, Arrival)> = Vec::new();
-        let mut header = false;
+        let mut columns = 0;
         loop {
             let more = reader.read_record(&mut record).map_err(|error| {
                 let line = line_of(bytes, error.position());
@@ -200,19 +206,25 @@ impl DemandReader<'_> {
             }
             let place = place(line_of(bytes, record.position()));
             let found = record.iter().collect::<Vec<_>>().join(",");
-            if !header {
-                if found != HEADER {
-                    return Err(bad(place, format!("{found:?}"), &format!("the header {HEADER}")));
-                }
-                header = true;
+            if columns == 0 {
+                columns = match found.as_str() {
+                    HEADER => 3,
+                    HEADER_WITH_ROUTES => 4,
+                    _ => return Err(bad(place, format!("{found:?}"), &format!("the header {HEADER}"))),
+                };
                 continue;
             }
-            let [Some(time), Some(road), Some(speed), None] = [0, 1, 2, 3].map(|i| record.get(i)) else {
-                return Err(bad(place, format!("{found:?}"), &format!("three columns, {HEADER}")));
-            };
-            rows.push(self.row(place, [time, road, speed], rows.last().map(|(_, a)| a.time_s))?);
+            if record.len() != columns {
+                let expected = match columns {
+                    3 => format!("three columns, {HEADER}"),
+                    _ => format!("four columns, {HEADER_WITH_ROUTES}"),
+                };
+                return Err(bad(place, format!("{found:?}"), &expected));
+            }
+            let fields = [0, 1, 2, 3].map(|i| record.get(i).unwrap_or(""));
+            rows.push(self.row(place, fields, rows.last().map(|(_, a)| a.time_s))?);
         }
-        if header {
+        if columns > 0 {
             Ok(rows)
         } else {
             Err(bad(place(1), "an empty file".to_owned(), &format!("the header {HEADER}")))
@@ -222,7 +234,7 @@ impl DemandReader<'_> {
     fn row(
         &self,
         place: Place,
-        [time, road, speed]: [&str; 3],
+        [time, road, speed, route]: [&str; 4],
         previous_s: Option<f64>,
     ) -> Result<(u32, Arrival), ScenarioError> {
         let bad = |key: &str, found: &str, problem: Option<&str>, expected: String| {
@@ -248,10 +260,22 @@ impl DemandReader<'_> {
             let expected = format!("one of {}{hint}", self.roads.join(", "));
             return bad("road", road, Some("unknown road"), expected);
         };
+        let routes = &self.routes[index];
+        let route = match route.trim() {
+            "" => None,
+            name => match routes.iter().position(|route| route.name == name) {
+                Some(at) => Some(at as u32),
+                None => {
+                    let known: Vec<&str> = routes.iter().map(|route| route.name.as_str()).collect();
+                    let expected = format!("nothing, or a route of the road: {}", known.join(", "));
+                    return bad("route", name, Some("unknown route"), expected);
+                }
+            },
+        };
         let VehicleParams { v_min_mps, v_max_mps, .. } = self.vehicle;
         match speed.trim().parse::<f64>() {
             Ok(speed_mps) if (v_min_mps..=v_max_mps).contains(&speed_mps) => {
-                Ok((index as u32, Arrival { time_s, speed_mps }))
+                Ok((index as u32, Arrival { time_s, speed_mps, route }))
             }
             _ => {
                 let expected = format!("a speed within the vehicles' {v_min_mps} to {v_max_mps} m/s");

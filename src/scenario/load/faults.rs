@@ -50,7 +50,7 @@ fn noise(t: &Table<'_>) -> Result<Noise, ScenarioError> {
 }
 
 fn sensor(t: &Table<'_>, zones: &[Zone]) -> Result<SensorFault, ScenarioError> {
-    let all = ["kind", "zones", "approaches", "fraction", "from_s", "until_s", "position_m", "speed_mps"];
+    let all = ["kind", "zones", "paths", "fraction", "from_s", "until_s", "position_m", "speed_mps"];
     // Without a kind the other keys cannot be judged; a misspelt "kind" is still found here.
     t.only(&all)?;
     let kind = t.need("kind", "\"bias\" or \"frozen\"")?;
@@ -96,16 +96,16 @@ fn commands(t: &Table<'_>) -> Result<CommandFaults, ScenarioError> {
 }
 
 fn stall(t: &Table<'_>, zones: &[Zone]) -> Result<Stall, ScenarioError> {
-    t.only(&["zones", "approaches", "fraction", "from_s", "until_s"])?;
+    t.only(&["zones", "paths", "fraction", "from_s", "until_s"])?;
     Ok(Stall { scope: scope(t, zones)?, span: span(t)? })
 }
 
 /// Everywhere and everybody, unless something narrower is given.
 fn scope(t: &Table<'_>, zones: &[Zone]) -> Result<Scope, ScenarioError> {
-    let approaches = scope::approaches(t, zones, |_, _, _| Ok(()))?;
+    let paths = scope::paths(t, zones, |_, _, _| Ok(()))?;
     let within = |f| f > 0.0 && f <= 1.0;
     Ok(Scope {
-        approaches: (!approaches.is_empty()).then_some(approaches),
+        paths: (!paths.is_empty()).then_some(paths),
         fraction: t.f64_or("fraction", 1.0, within, "a fraction with 0 < fraction <= 1")?,
     })
 }

@@ -1,4 +1,4 @@
-//! `[[controllers]]`: which approaches a controller written elsewhere drives.
+//! `[[controllers]]`: which paths a controller written elsewhere drives.
 
 use super::error::ScenarioError;
 use super::scope;
@@ -10,13 +10,13 @@ const MAX_PLUGINS: usize = 63;
 
 /// Reads `[[controllers]]`.
 pub(super) fn read(root: &Table<'_>, zones: &[Zone]) -> Result<Vec<Plugin>, ScenarioError> {
-    const EXPECTED: &str = "a list of controllers, each with a name and zones or approaches";
+    const EXPECTED: &str = "a list of controllers, each with a name and zones or paths";
     if root.get("controllers").is_none() {
         return Ok(Vec::new());
     }
     let tables = root.tables("controllers", EXPECTED)?;
     for table in &tables {
-        table.only(&["name", "zones", "approaches", "command"])?;
+        table.only(&["name", "zones", "paths", "command"])?;
     }
     let names = super::topology::unique_names(&tables, "controller")?;
     let mut plugins: Vec<Plugin> = Vec::with_capacity(tables.len());
@@ -25,16 +25,16 @@ pub(super) fn read(root: &Table<'_>, zones: &[Zone]) -> Result<Vec<Plugin>, Scen
             return Err(table.need("name", "")?.bad(&format!("at most {MAX_PLUGINS} controllers")));
         }
         let is_free = |zone: ZoneId, path: u32, field: &Field<'_>| {
-            let taken = plugins.iter().find(|p| p.approaches.contains(&(zone, path)));
+            let taken = plugins.iter().find(|p| p.paths.contains(&(zone, path)));
             let Some(other) = taken else { return Ok(()) };
             let z = &zones[zone as usize];
-            let approach = &z.approaches[path as usize].name;
-            let problem = format!("{} drives {}.{approach} already", other.name, z.name);
-            Err(field.bad_because(Some(problem), "approaches no other controller drives"))
+            let path = &z.paths[path as usize].name;
+            let problem = format!("{} drives {}.{path} already", other.name, z.name);
+            Err(field.bad_because(Some(problem), "paths no other controller drives"))
         };
-        let approaches = scope::approaches(table, zones, is_free)?;
-        if approaches.is_empty() {
-            return Err(table.missing("zones", "zones = [\"NAME\", ...], or approaches instead"));
+        let paths = scope::paths(table, zones, is_free)?;
+        if paths.is_empty() {
+            return Err(table.missing("zones", "zones = [\"NAME\", ...], or paths instead"));
         }
         const COMMAND: &str = "a command line";
         let command = match table.get("command") {
@@ -44,7 +44,7 @@ pub(super) fn read(root: &Table<'_>, zones: &[Zone]) -> Result<Vec<Plugin>, Scen
                 text => Some(text.to_owned()),
             },
         };
-        plugins.push(Plugin { name: name.to_owned(), approaches, command });
+        plugins.push(Plugin { name: name.to_owned(), paths, command });
     }
     Ok(plugins)
 }

@@ -3,9 +3,12 @@
 use super::error::ScenarioError;
 use super::table::Table;
 use crate::scenario::{
-    Baseline, ControlParams, FeConditions, FlowPolicy, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
-    Segment, Solver, VehicleParams, ranges,
+    Baseline, ControlParams, FeConditions, FlowPolicy, LawKind, Observed, PositionFeedback, ReferenceLaw,
+    Replan, SafetyRows, Solver, VehicleKind, VehicleParams, ranges,
 };
+
+/// No more kinds of vehicles than this.
+pub(in crate::scenario) const MAX_KINDS: usize = 64;
 
 /// `[vehicle]`, or the defaults.
 pub(super) fn vehicle(table: Option<&Table<'_>>) -> Result<VehicleParams, ScenarioError> {
@@ -19,16 +22,16 @@ pub(super) fn vehicle(table: Option<&Table<'_>>) -> Result<VehicleParams, Scenar
         standstill_gap_m: 0.0,
     };
     let Some(t) = table else { return Ok(params) };
-    t.only(&[
-        "u_min_mps2",
-        "u_max_mps2",
-        "v_min_mps",
-        "v_max_mps",
-        "length_m",
-        "reaction_time_s",
-        "standstill_gap_m",
-    ])?;
-    let p = &mut params;
+    t.only(&VEHICLE_KEYS)?;
+    read_vehicle(t, &mut params)?;
+    Ok(params)
+}
+
+const VEHICLE_KEYS: [&str; 7] =
+    ["u_min_mps2", "u_max_mps2", "v_min_mps", "v_max_mps", "length_m", "reaction_time_s", "standstill_gap_m"];
+
+/// Reads what a table says of vehicles; what it does not say stays as it is.
+fn read_vehicle(t: &Table<'_>, p: &mut VehicleParams) -> Result<(), ScenarioError> {
     p.u_min_mps2 = t.within_or("u_min_mps2", p.u_min_mps2, &ranges::BRAKING)?;
     p.u_max_mps2 = t.within_or("u_max_mps2", p.u_max_mps2, &ranges::ACCELERATION)?;
     p.v_min_mps = t.within_or("v_min_mps", p.v_min_mps, &ranges::LEAST_SPEED)?;
@@ -39,7 +42,40 @@ pub(super) fn vehicle(table: Option<&Table<'_>>) -> Result<VehicleParams, Scenar
     p.length_m = t.within_or("length_m", p.length_m, &ranges::VEHICLE_LENGTH)?;
     p.reaction_time_s = t.within_or("reaction_time_s", p.reaction_time_s, &ranges::REACTION_TIME)?;
     p.standstill_gap_m = t.within_or("standstill_gap_m", p.standstill_gap_m, &ranges::STANDSTILL_GAP)?;
-    Ok(params)
+    Ok(())
+}
+
+/// `[[fleet]]`: kinds of vehicles, each with the keys of `[vehicle]` in which it differs; without it, one kind.
+pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<VehicleKind>, ScenarioError> {
+    if root.get("fleet").is_none() {
+        return Ok(vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: *vehicle }]);
+    }
+    let tables = root.tables("fleet", "a list of kinds of vehicles, each with a name")?;
+    let names = super::topology::unique_names(&tables, "kind of vehicle")?;
+    let mut kinds = Vec::with_capacity(tables.len());
+    for (t, name) in tables.iter().zip(names) {
+        t.only(&[&["name", "share"][..], &VEHICLE_KEYS].concat())?;
+        if kinds.len() == MAX_KINDS {
+            return Err(t.need("name", "")?.bad(&format!("at most {MAX_KINDS} kinds")));
+        }
+        let mut own = *vehicle;
+        read_vehicle(t, &mut own)?;
+        if own.v_max_mps > vehicle.v_max_mps {
+            let expected = format!("at most that of [vehicle], {} m/s", vehicle.v_max_mps);
+            return Err(t.need("v_max_mps", &expected)?.bad(&expected));
+        }
+        let share = t.within_or("share", 1.0, &ranges::SHARE)?;
+        kinds.push(VehicleKind { name: name.to_owned(), share, vehicle: own });
+    }
+    Ok(kinds)
+}
+
+/// `law` of `[control]` or of a zone.
+pub(super) fn law(table: Option<&Table<'_>>, default: LawKind) -> Result<LawKind, ScenarioError> {
+    match table.and_then(|t| t.get("law")) {
+        None => Ok(default),
+        Some(field) => field.choice(&[("ocbf", LawKind::Ocbf)]),
+    }
 }
 
 /// `[objective]`: beta, in m^2/s^4, given or from alpha.
@@ -86,6 +122,7 @@ pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlPar
     };
     let Some(t) = table else { return Ok(params) };
     t.only(&[
+        "law",
         "reference",
         "replan",
         "position_feedback",
@@ -220,8 +257,8 @@ pub(super) fn flow(
         });
     }
     let segment = match t.get("segment_m") {
-        None => Segment::Whole,
-        Some(field) => Segment::First(field.f64(segment_ok, &segment)?),
+        None => Observed::Whole,
+        Some(field) => Observed::First(field.f64(segment_ok, &segment)?),
     };
     Ok(FlowPolicy::Feedback { baseline: baseline(&t, v_max)?, gain_mps, segment, min_mps })
 }

@@ -31,6 +31,13 @@ impl<'a> Table<'a> {
         Self { document, path: String::new(), origin: document.root.origin, entries }
     }
 
+    /// All entries, in order of key.
+    pub(super) fn entries(&self) -> impl Iterator<Item = (&'a str, Field<'a>)> + '_ {
+        self.entries
+            .iter()
+            .map(|(key, node)| (key.as_str(), Field { document: self.document, path: self.key(key), node }))
+    }
+
     /// Refuses keys other than these. Called first, so that a misspelt key is reported as such and not as a
     /// missing one. Of several, the first one in the file.
     pub(super) fn only(&self, known: &[&str]) -> Result<(), ScenarioError> {
@@ -171,14 +178,7 @@ impl<'a> Table<'a> {
 
     /// A name that must be there.
     pub(super) fn name(&self) -> Result<&'a str, ScenarioError> {
-        const EXPECTED: &str = "a name of 1 to 64 letters, digits, '_' or '-'";
-        let field = self.need("name", EXPECTED)?;
-        let name = field.str(EXPECTED)?;
-        let allowed = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
-        if name.is_empty() || name.len() > 64 || !name.chars().all(allowed) {
-            return Err(field.bad(EXPECTED));
-        }
-        Ok(name)
+        self.need("name", EXPECTED_NAME)?.word()
     }
 
     /// The tables of an array of tables that must be there and not empty.
@@ -188,7 +188,19 @@ impl<'a> Table<'a> {
     }
 }
 
+const EXPECTED_NAME: &str = "a name of 1 to 64 letters, digits, '_' or '-'";
+
 impl<'a> Field<'a> {
+    /// A string that may be a name.
+    pub(super) fn word(&self) -> Result<&'a str, ScenarioError> {
+        let name = self.str(EXPECTED_NAME)?;
+        let allowed = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+        if name.is_empty() || name.len() > 64 || !name.chars().all(allowed) {
+            return Err(self.bad(EXPECTED_NAME));
+        }
+        Ok(name)
+    }
+
     /// The error for a value that is not what was expected.
     pub(super) fn bad(&self, expected: &str) -> ScenarioError {
         self.bad_because(None, expected)

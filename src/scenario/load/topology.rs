@@ -1,11 +1,17 @@
-//! How zones and roads hang together: sources resolved, cycles refused, zones sorted.
+//! How zones and roads hang together: lanes, paths and exits read, sources resolved, zones sorted.
 
 use super::error::{ScenarioError, nearest};
+use super::sections;
 use super::table::{Field, Table};
-use crate::scenario::{Approach, Exit, FlowPolicy, Source, Zone, ranges};
+use crate::scenario::{
+    Crossing, Downstream, Exit, FlowPolicy, LawKind, PassingOrder, Path, Segment, Source, Zone, ranges,
+};
 
-/// No more zones, roads, or approaches of a zone than this: frames carry their indices in 16 bits.
+/// No more zones, roads, or paths of a zone than this: frames carry their indices in 16 bits.
 pub(in crate::scenario) const MAX_COUNT: usize = 65_535;
+
+/// Name of the one exit of a zone in the short form.
+const ONLY_EXIT: &str = "exit";
 
 /// The network's shape; flow policies are still [`FlowPolicy::None`].
 pub(super) struct Topology {
@@ -13,7 +19,7 @@ pub(super) struct Topology {
     pub(super) zones: Vec<Zone>,
     /// For each of them, its index as declared.
     pub(super) declared: Vec<usize>,
-    /// Zone and approach each road leads to.
+    /// Zone and entrance each road leads to.
     pub(super) road_ends: Vec<(u32, u32)>,
 }
 
@@ -37,38 +43,48 @@ pub(super) fn unique_names<'a>(tables: &[Table<'a>], what: &str) -> Result<Vec<&
     Ok(names)
 }
 
-/// Reads all approaches; `step_m` is the farthest a vehicle may go in one step, at `v_max_mps`.
+/// The keys of a zone's table.
+pub(super) const ZONE_KEYS: [&str; 9] =
+    ["name", "flow", "approaches", "segments", "paths", "exits", "crossings", "order", "law"];
+
+/// Reads all zones; `step_m` is the farthest a vehicle may go in one step.
 pub(super) fn read(
     zones: &[Table<'_>],
     zone_names: &[&str],
     roads: &[Table<'_>],
     road_names: &[&str],
     (step_m, v_max_mps): (f64, f64),
+    law: LawKind,
 ) -> Result<Topology, ScenarioError> {
+    // What zones have inside comes first, so that sources may name exits of any zone.
+    let mut shapes = Vec::with_capacity(zones.len());
+    for (table, name) in zones.iter().zip(zone_names) {
+        shapes.push(zone(table, name, step_m, law)?);
+    }
+    let exit_names: Vec<Vec<String>> =
+        shapes.iter().map(|s| s.zone.exits.iter().map(|e| e.name.clone()).collect()).collect();
     let mut claims = Claims {
-        exits: vec![None; zones.len()],
+        exits: exit_names.iter().map(|names| vec![None; names.len()]).collect(),
+        exit_names,
         roads: vec![None; roads.len()],
-        exit_fields: vec![None; zones.len()],
         step_m,
         v_max_mps,
     };
-    let mut approaches = Vec::with_capacity(zones.len());
-    for (zone, table) in zones.iter().enumerate() {
-        const APPROACHES: &str = "a list of approaches, at least one";
-        let tables = table.tables("approaches", APPROACHES)?;
-        let names = unique_names(&tables, "approach of the zone")?;
-        let mut read = Vec::with_capacity(tables.len());
-        for (path, (table, name)) in tables.iter().zip(names).enumerate() {
-            read.push(claims.approach(table, name, (zone, path), zone_names, road_names)?);
+    for (index, shape) in shapes.iter_mut().enumerate() {
+        let Shape { zone, entrances } = shape;
+        for (segment, table) in entrances {
+            let end = (index as u32, *segment as u32);
+            zone.segments[*segment].source = Some(claims.source(table, end, zone_names, road_names)?);
         }
-        approaches.push(read);
     }
-    // Before the roads: whoever closes a cycle has mostly taken an approach from a road.
-    let declared = sort(&approaches, &claims, zone_names)?;
+    let mut sorted_zones: Vec<Zone> = shapes.into_iter().map(|shape| shape.zone).collect();
+    // Before the roads: whoever closes a cycle has mostly taken an entrance from a road.
+    claims.require_way_out(zone_names)?;
+    let declared = sort(&sorted_zones);
     let mut road_ends = Vec::with_capacity(roads.len());
     for (table, claim) in roads.iter().zip(&claims.roads) {
         match claim {
-            Some((zone, path, _)) => road_ends.push((*zone, *path)),
+            Some((zone, segment, _)) => road_ends.push((*zone, *segment)),
             None => {
                 let expected = "an approach with this road as its source";
                 let field = table.need("name", expected)?;
@@ -82,67 +98,283 @@ pub(super) fn read(
     for (new, &old) in declared.iter().enumerate() {
         sorted[old] = new as u32;
     }
-    let zones = declared.iter().map(|&old| Zone {
-        name: zone_names[old].to_owned(),
-        approaches: approaches[old]
-            .iter()
-            .map(|a| match a.source {
-                Source::Zone(z) => Approach { source: Source::Zone(sorted[z as usize]), ..a.clone() },
-                Source::Road(_) => a.clone(),
-            })
-            .collect(),
-        exit: match claims.exits[old] {
-            None => Exit::Out,
-            Some((zone, path, link)) => {
-                let (link_m, link_speed_mps) = link;
-                Exit::Zone { zone: sorted[zone as usize], path, link_m, link_speed_mps }
+    for (zone, exits) in sorted_zones.iter_mut().zip(&claims.exits) {
+        for segment in &mut zone.segments {
+            if let Some(Source::Zone { zone, .. }) = &mut segment.source {
+                *zone = sorted[*zone as usize];
             }
-        },
-        flow: FlowPolicy::None,
-    });
-    let zones = zones.collect();
-    let road_ends = road_ends.into_iter().map(|(zone, path)| (sorted[zone as usize], path)).collect();
+        }
+        for (exit, claim) in zone.exits.iter_mut().zip(exits) {
+            exit.to =
+                claim.as_ref().map(|claim| Downstream { zone: sorted[claim.to.zone as usize], ..claim.to });
+        }
+    }
+    let mut slots: Vec<Option<Zone>> = sorted_zones.into_iter().map(Some).collect();
+    let zones = declared.iter().map(|&old| slots[old].take().expect("each zone is sorted once")).collect();
+    let road_ends = road_ends.into_iter().map(|(zone, segment)| (sorted[zone as usize], segment)).collect();
     Ok(Topology { zones, declared, road_ends })
 }
 
-/// Zone, approach, and the link's length and speed.
-type ExitClaim = (u32, u32, (f64, f64));
+/// A zone as far as its own table tells, and the tables of its entrances.
+struct Shape<'a> {
+    zone: Zone,
+    entrances: Vec<(usize, Table<'a>)>,
+}
+
+fn zone<'a>(table: &Table<'a>, name: &str, step_m: f64, law: LawKind) -> Result<Shape<'a>, ScenarioError> {
+    let order = table
+        .choice_or_first("order", &[("fifo", PassingOrder::Fifo), ("per_point", PassingOrder::PerPoint)])?;
+    let zone = Zone {
+        name: name.to_owned(),
+        segments: Vec::new(),
+        paths: Vec::new(),
+        exits: Vec::new(),
+        crossings: Vec::new(),
+        order,
+        law: sections::law(Some(table), law)?,
+    };
+    match table.either("approaches", "segments") {
+        (Some(_), Some(segments)) => {
+            let problem = Some("approaches are given as well".to_owned());
+            Err(segments.bad_because(problem, "either approaches, or segments and paths"))
+        }
+        (None, Some(_)) => full(table, zone, step_m),
+        _ => short(table, zone, step_m),
+    }
+}
+
+/// How long something must be that a vehicle may not pass within one step.
+fn whole_length(step_m: f64) -> (impl Fn(f64) -> bool, String) {
+    let length = ranges::APPROACH_LENGTH;
+    let why = "v_max_mps * dt_s, so that a vehicle passes at most one boundary per step";
+    (move |l| length.contains(l) && l >= step_m, format!("{length}, >= {step_m} m = {why}"))
+}
+
+/// The short form of a merge: approaches that end in one conflict point, and one exit.
+fn short<'a>(table: &Table<'a>, mut zone: Zone, step_m: f64) -> Result<Shape<'a>, ScenarioError> {
+    const APPROACHES: &str = "a list of approaches, at least one";
+    for key in ["paths", "exits", "crossings"] {
+        if let Some(field) = table.get(key) {
+            return Err(field
+                .bad_because(Some("the zone has no segments".into()), &format!("{key} only with segments")));
+        }
+    }
+    let tables = table.tables("approaches", APPROACHES)?;
+    let names = unique_names(&tables, "approach of the zone")?;
+    let (is_length, expected) = whole_length(step_m);
+    for (index, (t, name)) in tables.iter().zip(names).enumerate() {
+        t.only(&["name", "length_m", "road", "zone", "exit", "link_m", "link_speed_mps"])?;
+        let length_m = t.f64("length_m", &is_length, &expected)?;
+        let name = name.to_owned();
+        zone.segments.push(Segment { name: name.clone(), length_m, source: None, shape: Vec::new() });
+        zone.paths.push(Path { name, segments: vec![index as u32], exit: 0, length_m, share: 1.0 });
+    }
+    zone.exits.push(Exit { name: ONLY_EXIT.to_owned(), to: None, flow: FlowPolicy::None });
+    Ok(Shape { zone, entrances: tables.into_iter().enumerate().collect() })
+}
+
+/// The full form: segments, paths over them, exits, and crossings.
+fn full<'a>(table: &Table<'a>, mut zone: Zone, step_m: f64) -> Result<Shape<'a>, ScenarioError> {
+    let segments = table.tables("segments", "a list of segments, at least one")?;
+    let segment_names = unique_names(&segments, "segment of the zone")?;
+    for (t, name) in segments.iter().zip(&segment_names) {
+        zone.segments.push(segment(t, name)?);
+    }
+    if table.get("exits").is_some() {
+        let exits = table.tables("exits", "a list of exits, at least one")?;
+        for (t, name) in exits.iter().zip(unique_names(&exits, "exit of the zone")?) {
+            t.only(&["name", "flow"])?;
+            zone.exits.push(Exit { name: name.to_owned(), to: None, flow: FlowPolicy::None });
+        }
+    }
+    let declares_exits = !zone.exits.is_empty();
+    let paths = table.tables("paths", "a list of paths over the segments, at least one")?;
+    let path_names = unique_names(&paths, "path of the zone")?;
+    let mut is_used = vec![false; segments.len()];
+    let (is_length, expected_length) = whole_length(step_m);
+    for (t, name) in paths.iter().zip(&path_names) {
+        t.only(&["name", "segments", "exit", "share"])?;
+        const SEGMENTS: &str = "a list of segment names from an entrance to an exit";
+        let mut own: Vec<u32> = Vec::new();
+        for item in t.need("segments", SEGMENTS)?.items(SEGMENTS)? {
+            let index = find(&item, "segment", &segment_names)?;
+            let is_entrance = is_entrance(&segments[index]);
+            if own.contains(&(index as u32)) {
+                return Err(item.bad_because(Some("used twice".into()), "each segment once in a path"));
+            }
+            if own.is_empty() && !is_entrance {
+                let problem = Some("it has no source".to_owned());
+                return Err(item.bad_because(problem, "a first segment with road or zone"));
+            }
+            if !own.is_empty() && is_entrance {
+                let problem = Some("it is an entrance of the zone".to_owned());
+                return Err(item.bad_because(problem, "entrances only as the first segment of a path"));
+            }
+            is_used[index] = true;
+            own.push(index as u32);
+        }
+        let length_m = own.iter().map(|&s| zone.segments[s as usize].length_m).sum();
+        if !is_length(length_m) {
+            let problem = Some(format!("the path is {length_m} m long"));
+            return Err(t.need("segments", SEGMENTS)?.bad_because(problem, &expected_length));
+        }
+        const EXIT: &str = "the name of an exit";
+        let exit = match t.get("exit") {
+            None if zone.exits.len() == 1 && declares_exits => 0,
+            None if !declares_exits && path_names.len() == 1 => {
+                zone.exits.push(Exit { name: ONLY_EXIT.to_owned(), to: None, flow: FlowPolicy::None });
+                0
+            }
+            None => return Err(t.missing("exit", EXIT)),
+            Some(field) => {
+                let word = field.str(EXIT)?;
+                match zone.exits.iter().position(|e| e.name == word) {
+                    Some(at) => at,
+                    None if declares_exits => {
+                        let known: Vec<&str> = zone.exits.iter().map(|e| e.name.as_str()).collect();
+                        find(&field, "exit", &known)?
+                    }
+                    None => {
+                        let name = field.word()?.to_owned();
+                        zone.exits.push(Exit { name, to: None, flow: FlowPolicy::None });
+                        zone.exits.len() - 1
+                    }
+                }
+            }
+        };
+        let share = t.within_or("share", 1.0, &ranges::SHARE)?;
+        zone.paths.push(Path { name: (*name).to_owned(), segments: own, exit: exit as u32, length_m, share });
+    }
+    if let Some(unused) = is_used.iter().position(|used| !used) {
+        let expected = "a segment that some path uses";
+        let field = segments[unused].need("name", expected)?;
+        return Err(field.bad_because(Some("no path uses this segment".into()), expected));
+    }
+    for (index, exit) in zone.exits.iter().enumerate() {
+        if !zone.paths.iter().any(|path| path.exit as usize == index) {
+            let expected = "an exit that some path leads to";
+            let exits = table.tables("exits", expected)?;
+            let field = exits[index].need("name", expected)?;
+            return Err(field.bad_because(Some(format!("no path leads to {}", exit.name)), expected));
+        }
+    }
+    if table.get("crossings").is_some() {
+        let crossings = table.tables("crossings", "a list of crossings")?;
+        let names = unique_names(&crossings, "crossing of the zone")?;
+        for (t, name) in crossings.iter().zip(names) {
+            let crossing = crossing(t, name, &zone, &segment_names)?;
+            zone.crossings.push(crossing);
+        }
+    }
+    let entrances = segments.into_iter().enumerate().filter(|(_, t)| is_entrance(t));
+    Ok(Shape { zone, entrances: entrances.collect() })
+}
+
+fn is_entrance(segment: &Table<'_>) -> bool {
+    segment.get("road").is_some() || segment.get("zone").is_some()
+}
+
+fn segment(t: &Table<'_>, name: &str) -> Result<Segment, ScenarioError> {
+    t.only(&["name", "length_m", "shape", "road", "zone", "exit", "link_m", "link_speed_mps"])?;
+    let mut shape: Vec<[f64; 2]> = Vec::new();
+    if let Some(field) = t.get("shape") {
+        const SHAPE: &str = "a list of at least two points [x, y], in m, each within 1e7 m of the origin";
+        for point in field.items(SHAPE)? {
+            let coordinates = point.items(SHAPE)?;
+            let [x, y] = &coordinates[..] else { return Err(point.bad(SHAPE)) };
+            let number = |field: &Field<'_>| field.f64(|m| m.abs() <= 1e7, SHAPE);
+            shape.push([number(x)?, number(y)?]);
+        }
+        if shape.len() < 2 {
+            return Err(field.bad(SHAPE));
+        }
+    }
+    let drawn_m: f64 = shape.windows(2).map(|w| (w[1][0] - w[0][0]).hypot(w[1][1] - w[0][1])).sum();
+    let length_m = match (t.get("length_m"), shape.is_empty()) {
+        // Rounded, so that no last bit of a square root matters.
+        (None, false) => (drawn_m * 1e6).round() / 1e6,
+        _ => t.within("length_m", &ranges::SEGMENT_LENGTH)?,
+    };
+    if !ranges::SEGMENT_LENGTH.contains(length_m) {
+        let field = t.need("shape", "")?;
+        return Err(
+            field.bad_because(Some(format!("it is {length_m} m long")), &ranges::SEGMENT_LENGTH.to_string())
+        );
+    }
+    Ok(Segment { name: name.to_owned(), length_m, source: None, shape })
+}
+
+fn crossing(
+    t: &Table<'_>,
+    name: &str,
+    zone: &Zone,
+    segment_names: &[&str],
+) -> Result<Crossing, ScenarioError> {
+    t.only(&["name", "length_m", "at"])?;
+    const AT: &str = "a table of places such as {north = 12.5, west = 8}, at least two";
+    let length_m = t.within("length_m", &ranges::CROSSING_LENGTH)?;
+    let field = t.need("at", AT)?;
+    let mut places: Vec<(u32, f64)> = Vec::new();
+    for (key, place) in field.table(AT)?.entries() {
+        let Some(segment) = segment_names.iter().position(|n| *n == key) else {
+            let hint = nearest(key, segment_names.iter().copied());
+            let hint = hint.map(|h| format!("; did you mean {h}?")).unwrap_or_default();
+            return Err(
+                place.bad_because(Some("unknown segment".into()), &format!("names of segments{hint}"))
+            );
+        };
+        let longest_m = zone.segments[segment].length_m;
+        let at_m = place.f64(
+            |m| (0.0..=longest_m).contains(&m),
+            &format!("a distance from 0 to {longest_m} m, the segment's length"),
+        )?;
+        places.push((segment as u32, at_m));
+    }
+    places.sort_by_key(|(segment, _)| *segment);
+    if places.len() < 2 {
+        return Err(field.bad(AT));
+    }
+    for path in &zone.paths {
+        if places.iter().filter(|(segment, _)| path.segments.contains(segment)).count() > 1 {
+            let problem = Some(format!("path {} uses two of them", path.name));
+            return Err(field.bad_because(problem, "segments that no path shares"));
+        }
+    }
+    Ok(Crossing { name: name.to_owned(), length_m, places })
+}
 
 /// Who uses which exit and which road, by indices as declared.
 struct Claims<'a> {
-    exits: Vec<Option<ExitClaim>>,
-    /// The `zone` key that claimed each exit, for messages.
-    exit_fields: Vec<Option<Field<'a>>>,
-    /// Zone, approach, and the key path that claimed it.
+    /// By zone and exit.
+    exits: Vec<Vec<Option<Claim<'a>>>>,
+    exit_names: Vec<Vec<String>>,
+    /// Zone, entrance, and the key path that claimed it.
     roads: Vec<Option<(u32, u32, String)>>,
     step_m: f64,
     v_max_mps: f64,
 }
 
+/// An entrance that claimed an exit.
+#[derive(Clone)]
+struct Claim<'a> {
+    to: Downstream,
+    /// The `zone` key that says so, for messages.
+    field: Field<'a>,
+}
+
 impl<'a> Claims<'a> {
-    fn approach(
+    fn source(
         &mut self,
         t: &Table<'a>,
-        name: &str,
-        (zone, path): (usize, usize),
+        (zone, segment): (u32, u32),
         zone_names: &[&str],
         road_names: &[&str],
-    ) -> Result<Approach, ScenarioError> {
-        t.only(&["name", "length_m", "road", "zone", "link_m", "link_speed_mps"])?;
+    ) -> Result<Source, ScenarioError> {
         let step_m = self.step_m;
-        let why = "v_max_mps * dt_s, so that a vehicle passes at most one boundary per step";
-        let (length, link) = (ranges::APPROACH_LENGTH, ranges::LINK_LENGTH);
-        let expected = format!("{length}, >= {step_m} m = {why}");
-        let length_m = t.f64("length_m", |l| length.contains(l) && l >= step_m, &expected)?;
-        let end = (zone as u32, path as u32);
-        let source = match t.either("road", "zone") {
-            (None, None) => {
-                return Err(t.missing("road", "a source: road = \"NAME\", or zone = \"NAME\" upstream"));
-            }
+        match t.either("road", "zone") {
+            (None, None) => Err(t.missing("road", "a source: road = \"NAME\", or zone = \"NAME\" upstream")),
             (Some(_), Some(zone)) => {
-                return Err(
-                    zone.bad_because(Some("road is given as well".into()), "one source, either road or zone")
-                );
+                Err(zone.bad_because(Some("road is given as well".into()), "one source, either road or zone"))
             }
             (Some(field), None) => {
                 let road = find(&field, "road", road_names)?;
@@ -150,22 +382,40 @@ impl<'a> Claims<'a> {
                     let problem = Some(format!("{other} uses this road already"));
                     return Err(field.bad_because(problem, "a road no other approach uses"));
                 }
-                self.roads[road] = Some((end.0, end.1, t.key("road")));
-                // A road by --set in place of the file's zone leaves that zone's link without meaning.
-                for key in ["link_m", "link_speed_mps"] {
-                    if let Some(link) = t.get(key).filter(|link| link.is_set() || !field.is_set()) {
+                self.roads[road] = Some((zone, segment, t.key("road")));
+                // A road by --set in place of the file's zone leaves that zone's keys without meaning.
+                for key in ["link_m", "link_speed_mps", "exit"] {
+                    if let Some(other) = t.get(key).filter(|other| other.is_set() || !field.is_set()) {
                         let problem = Some("the source is a road".to_owned());
-                        return Err(link.bad_because(problem, &format!("{key} only with zone")));
+                        return Err(other.bad_because(problem, &format!("{key} only with zone")));
                     }
                 }
-                Source::Road(road as u32)
+                Ok(Source::Road(road as u32))
             }
             (None, Some(field)) => {
                 let upstream = find(&field, "zone", zone_names)?;
-                if let Some(other) = &self.exit_fields[upstream] {
-                    let problem = Some(format!("{} claims the exit of this zone already", other.path));
+                let names = &self.exit_names[upstream];
+                let exit = match (t.get("exit"), names.len()) {
+                    (None, 1) => 0,
+                    (None, _) => {
+                        let expected = format!(
+                            "the exit of {} it comes from: {}",
+                            zone_names[upstream],
+                            names.join(", ")
+                        );
+                        return Err(t.missing("exit", &expected));
+                    }
+                    (Some(field), _) => {
+                        let names: Vec<&str> = names.iter().map(String::as_str).collect();
+                        find(&field, "exit", &names)?
+                    }
+                };
+                if let Some(other) = &self.exits[upstream][exit] {
+                    let problem = Some(format!("{} claims the exit of this zone already", other.field.path));
                     return Err(field.bad_because(problem, "a zone whose exit leads nowhere else"));
                 }
+                let link = ranges::LINK_LENGTH;
+                let why = "v_max_mps * dt_s, so that a vehicle passes at most one boundary per step";
                 let expected = format!("{link}, >= {step_m} m = {why}");
                 let is_link = |l| link.contains(l) && (l == 0.0 || l >= step_m);
                 let link_m = t.f64_or("link_m", 0.0, is_link, &expected)?;
@@ -173,12 +423,54 @@ impl<'a> Claims<'a> {
                 let expected = format!("{}, <= v_max_mps = {v_max_mps}", ranges::LINK_SPEED);
                 let is_speed = |v| ranges::LINK_SPEED.contains(v) && v <= v_max_mps;
                 let link_speed_mps = t.f64_or("link_speed_mps", v_max_mps / 2.0, is_speed, &expected)?;
-                self.exits[upstream] = Some((end.0, end.1, (link_m, link_speed_mps)));
-                self.exit_fields[upstream] = Some(field);
-                Source::Zone(upstream as u32)
+                let to = Downstream { zone, segment, link_m, link_speed_mps };
+                self.exits[upstream][exit] = Some(Claim { to, field });
+                Ok(Source::Zone { zone: upstream as u32, exit: exit as u32 })
             }
-        };
-        Ok(Approach { name: name.to_owned(), length_m, source })
+        }
+    }
+
+    /// Refuses networks with zones from which nobody ever comes out.
+    fn require_way_out(&self, names: &[&str]) -> Result<(), ScenarioError> {
+        let count = self.exits.len();
+        let mut feeders: Vec<Vec<usize>> = vec![Vec::new(); count];
+        for (zone, exits) in self.exits.iter().enumerate() {
+            exits.iter().flatten().for_each(|claim| feeders[claim.to.zone as usize].push(zone));
+        }
+        let mut has_way: Vec<bool> =
+            self.exits.iter().map(|exits| exits.iter().any(Option::is_none)).collect();
+        let mut found: Vec<usize> = (0..count).filter(|&zone| has_way[zone]).collect();
+        while let Some(zone) = found.pop() {
+            for &feeder in &feeders[zone] {
+                if !std::mem::replace(&mut has_way[feeder], true) {
+                    found.push(feeder);
+                }
+            }
+        }
+        let Some(start) = has_way.iter().position(|has| !has) else { return Ok(()) };
+        // All exits of such a zone lead to others like it: following them comes round.
+        let next =
+            |zone: usize| self.exits[zone][0].as_ref().expect("its exits all lead to zones").to.zone as usize;
+        let mut members = vec![start];
+        let mut is_member = vec![false; count];
+        is_member[start] = true;
+        let mut zone = next(start);
+        while !std::mem::replace(&mut is_member[zone], true) {
+            members.push(zone);
+            zone = next(zone);
+        }
+        members.drain(..members.iter().position(|&member| member == zone).unwrap_or(0));
+        let start = members[0];
+        // The connection to name is the one a --set made, if one did.
+        let field = |zone: usize| &self.exits[zone][0].as_ref().expect("its exits all lead to zones").field;
+        let blamed = members.iter().copied().find(|&zone| field(zone).is_set()).unwrap_or(start);
+        let field = field(blamed);
+        Err(ScenarioError::Cycle {
+            place: field.place(),
+            key: field.path.as_str().into(),
+            found: field.found().into(),
+            cycle: members.iter().chain([&start]).map(|z| names[*z]).collect::<Vec<_>>().join(" -> ").into(),
+        })
     }
 }
 
@@ -199,53 +491,43 @@ fn find(field: &Field<'_>, what: &str, names: &[&str]) -> Result<usize, Scenario
     found.ok_or_else(|| field.bad_because(Some(format!("unknown {what}")), &expected()))
 }
 
-/// Zones upstream first; among those that are free to come next, the one declared first.
-fn sort(
-    approaches: &[Vec<Approach>],
-    claims: &Claims<'_>,
-    names: &[&str],
-) -> Result<Vec<usize>, ScenarioError> {
-    let is_zone = |a: &&Approach| matches!(a.source, Source::Zone(_));
-    let mut waiting: Vec<usize> = approaches.iter().map(|a| a.iter().filter(is_zone).count()).collect();
+/// Zones upstream first; among those that are free to come next, the one declared first. Where a cycle leaves
+/// none free, the one declared first of all that are left.
+fn sort(zones: &[Zone]) -> Vec<usize> {
+    let sources = |zone: &Zone| {
+        let from = |s: &Segment| match s.source {
+            Some(Source::Zone { zone, .. }) => Some(zone as usize),
+            _ => None,
+        };
+        zone.segments.iter().filter_map(from).collect::<Vec<usize>>()
+    };
+    let mut waiting: Vec<usize> = zones.iter().map(|zone| sources(zone).len()).collect();
+    let mut feeds: Vec<Vec<usize>> = vec![Vec::new(); zones.len()];
+    for (index, zone) in zones.iter().enumerate() {
+        sources(zone).into_iter().for_each(|from| feeds[from].push(index));
+    }
+    let mut left: std::collections::BTreeSet<usize> = (0..zones.len()).collect();
     let mut ready: std::collections::BTreeSet<usize> =
         (0..waiting.len()).filter(|&z| waiting[z] == 0).collect();
     let mut order = Vec::with_capacity(waiting.len());
-    while let Some(zone) = ready.pop_first() {
+    while let Some(zone) = ready.pop_first().or_else(|| left.first().copied()) {
+        left.remove(&zone);
         order.push(zone);
-        if let Some((next, ..)) = claims.exits[zone] {
-            waiting[next as usize] -= 1;
-            if waiting[next as usize] == 0 {
-                ready.insert(next as usize);
+        for &next in &feeds[zone] {
+            waiting[next] -= 1;
+            if waiting[next] == 0 && left.contains(&next) {
+                ready.insert(next);
             }
         }
     }
-    let Some(start) = waiting.iter().position(|&count| count > 0) else { return Ok(order) };
-    // A zone has one exit, so what is left over are cycles and nothing else: following exits from any of
-    // them comes back to it.
-    let next = |zone: usize| claims.exits[zone].map_or(start, |(next, ..)| next as usize);
-    let mut members = vec![start];
-    let mut zone = next(start);
-    while zone != start && members.len() <= names.len() {
-        members.push(zone);
-        zone = next(zone);
-    }
-    // The connection to name is the one a --set made, if one did.
-    let is_set = |zone: &usize| claims.exit_fields[*zone].as_ref().is_some_and(Field::is_set);
-    let blamed = members.iter().copied().find(is_set).unwrap_or(start);
-    let field = claims.exit_fields[blamed].as_ref().expect("a zone of a cycle has an exit that was claimed");
-    Err(ScenarioError::Cycle {
-        place: field.place(),
-        key: field.path.as_str().into(),
-        found: field.found().into(),
-        cycle: members.iter().chain([&start]).map(|z| names[*z]).collect::<Vec<_>>().join(" -> ").into(),
-    })
+    order
 }
 
 #[cfg(test)]
 #[allow(clippy::unwrap_used)]
 mod tests {
     use super::super::{TraceBase, load_text};
-    use crate::scenario::{Exit, Scenario, Source, load_embedded};
+    use crate::scenario::{Downstream, Scenario, Source, load_embedded};
 
     /// Zones as (name, sources); a source that is no zone is a road.
     fn network(zones: &[(&str, &[&str])]) -> Scenario {
@@ -276,13 +558,13 @@ mod tests {
                 .network;
         let names: Vec<_> = n.zones.iter().map(|z| z.name.as_str()).collect();
         assert_eq!(names, ["x", "first", "mid", "last"]);
-        assert_eq!(n.zones[3].approaches[0].source, Source::Zone(2));
-        assert_eq!(n.zones[2].approaches[0].source, Source::Zone(1));
-        assert_eq!(n.zones[1].exit, Exit::Zone { zone: 2, path: 0, link_m: 0.0, link_speed_mps: 15.0 });
-        assert_eq!(n.zones[0].exit, Exit::Out);
+        assert_eq!(n.zones[3].segments[0].source, Some(Source::Zone { zone: 2, exit: 0 }));
+        assert_eq!(n.zones[2].segments[0].source, Some(Source::Zone { zone: 1, exit: 0 }));
+        assert_eq!(n.zones[1].exits[0].to, Some(Downstream { zone: 2, segment: 0, link_m: 0.0, link_speed_mps: 15.0 }));
+        assert_eq!(n.zones[0].exits[0].to, None);
         for (index, road) in n.roads.iter().enumerate() {
-            let approach = &n.zones[road.zone as usize].approaches[road.path as usize];
-            assert_eq!(approach.source, Source::Road(index as u32));
+            let entrance = &n.zones[road.zone as usize].segments[road.segment as usize];
+            assert_eq!(entrance.source, Some(Source::Road(index as u32)));
         }
     }
 
@@ -290,7 +572,7 @@ mod tests {
     fn the_embedded_networks() {
         let shape = |name| {
             let n = load_embedded(name, &[], None).unwrap().network;
-            let out = n.zones.iter().filter(|z| z.exit == Exit::Out).count();
+            let out = n.zones.iter().filter(|z| z.exits[0].to.is_none()).count();
             (n.zones.len(), n.roads.len(), out)
         };
         assert_eq!(shape("two-merges"), (2, 3, 1));

@@ -1,0 +1,262 @@
+//! `cz show --network`: a scenario's network as a picture.
+
+use super::AppError;
+use crate::conflict::{Conflicts, PointKind};
+use crate::scenario::{Network, Scenario, Source, ZoneId};
+use plotters::coord::Shift;
+use plotters::prelude::*;
+use plotters::style::register_font;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
+use std::path::Path;
+
+type Place = (f64, f64);
+
+/// Longer side of the picture, pixels.
+const SIZE_PX: f64 = 1400.0;
+/// Room around it, pixels.
+const MARGIN_PX: f64 = 60.0;
+/// How far apart lanes are drawn that have no shape, m.
+const APART_M: f64 = 40.0;
+const LANE: RGBColor = RGBColor(120, 120, 120);
+const ENTRANCE: RGBColor = RGBColor(44, 120, 60);
+const EXIT: RGBColor = RGBColor(31, 80, 160);
+const MERGE: RGBColor = RGBColor(230, 120, 0);
+const CROSSING: RGBColor = RGBColor(170, 30, 90);
+
+/// Writes the picture; the ending of the file decides on SVG or PNG.
+pub(super) fn network(scenario: &Scenario, path: &Path) -> Result<(), AppError> {
+    let picture = Picture::of(&scenario.network);
+    let size = picture.size_px();
+    // Fails only on bytes that are no font.
+    let _ = register_font("sans-serif", FontStyle::Normal, dejavu::sans::regular());
+    let drawn = match path.extension().and_then(|ending| ending.to_str()) {
+        Some("svg") => {
+            picture.draw(SVGBackend::new(path, size).into_drawing_area()).map_err(|e| e.to_string())
+        }
+        Some("png") => {
+            picture.draw(BitMapBackend::new(path, size).into_drawing_area()).map_err(|e| e.to_string())
+        }
+        _ => {
+            let file = path.display();
+            return Err(AppError::Usage(format!("--out {file}: expected a file that ends in .svg or .png")));
+        }
+    };
+    drawn.map_err(|error| AppError::Failed(format!("{}: cannot be drawn: {error}", path.display())))
+}
+
+/// What is drawn, in m.
+#[derive(Default)]
+struct Picture {
+    lanes: Vec<(Vec<Place>, RGBColor)>,
+    /// Between an exit and the entrance it leads to.
+    links: Vec<[Place; 2]>,
+    points: Vec<(Place, PointKind, String)>,
+    labels: Vec<(Place, String, RGBColor)>,
+}
+
+impl Picture {
+    fn of(network: &Network) -> Picture {
+        let shapes = layout(network);
+        let mut picture = Picture::default();
+        for (index, zone) in network.zones.iter().enumerate() {
+            for (segment, shape) in zone.segments.iter().zip(&shapes[index]) {
+                let color = if segment.source.is_some() { ENTRANCE } else { LANE };
+                picture.lanes.push((shape.clone(), color));
+                if let Some(Source::Road(road)) = segment.source {
+                    picture.labels.push((shape[0], network.roads[road as usize].name.clone(), ENTRANCE));
+                }
+            }
+            for (at, exit) in (0..).zip(&zone.exits) {
+                let mut ends = zone.paths.iter().filter(|path| path.exit == at);
+                let last = ends.next().and_then(|path| path.segments.last()).expect("an exit ends some path");
+                let shape = &shapes[index][*last as usize];
+                let end = shape[shape.len() - 1];
+                match exit.to {
+                    None => picture.labels.push((end, exit.name.clone(), EXIT)),
+                    Some(to) => picture.links.push([end, shapes[to.zone as usize][to.segment as usize][0]]),
+                }
+            }
+            picture.add_points(network, index as ZoneId, &shapes[index]);
+            let all: Vec<Place> = shapes[index].iter().flatten().copied().collect();
+            let mean = |of: fn(&Place) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
+            picture.labels.push(((mean(|p| p.0), mean(|p| p.1)), zone.name.clone(), BLACK));
+        }
+        picture
+    }
+
+    /// The conflict points of a zone, each where the first path that uses it passes it.
+    fn add_points(&mut self, network: &Network, zone: ZoneId, shapes: &[Vec<Place>]) {
+        let conflicts = Conflicts::of(network, zone);
+        let shape = &network.zones[zone as usize];
+        for (at, point) in (0..).zip(conflicts.points()) {
+            let used = (0..shape.paths.len() as u32)
+                .find_map(|path| Some((path, conflicts.uses(path).iter().find(|u| u.point == at)?.at_m)));
+            let Some((path, mut left_m)) = used else { continue };
+            for &segment in &shape.paths[path as usize].segments {
+                let length_m = shape.segments[segment as usize].length_m;
+                let is_last = shape.paths[path as usize].segments.last() == Some(&segment);
+                if left_m <= length_m || is_last {
+                    let place = along(&shapes[segment as usize], left_m / length_m);
+                    self.points.push((place, point.kind, point.name.clone()));
+                    break;
+                }
+                left_m -= length_m;
+            }
+        }
+    }
+
+    fn bounds(&self) -> (Place, Place) {
+        let places = || self.lanes.iter().flat_map(|(shape, _)| shape);
+        let least = |of: fn(&Place) -> f64| places().map(of).fold(f64::INFINITY, f64::min);
+        let most = |of: fn(&Place) -> f64| places().map(of).fold(f64::NEG_INFINITY, f64::max);
+        ((least(|p| p.0), least(|p| p.1)), (most(|p| p.0), most(|p| p.1)))
+    }
+
+    fn size_px(&self) -> (u32, u32) {
+        let (low, high) = self.bounds();
+        let (width, height) = ((high.0 - low.0).max(1.0), (high.1 - low.1).max(1.0));
+        let scale = SIZE_PX / width.max(height);
+        let px = |m: f64| ((m * scale).max(200.0) + 2.0 * MARGIN_PX) as u32;
+        (px(width), px(height))
+    }
+
+    fn draw<DB: DrawingBackend>(
+        &self,
+        area: DrawingArea<DB, Shift>,
+    ) -> Result<(), DrawingAreaErrorKind<DB::ErrorType>> {
+        area.fill(&WHITE)?;
+        let (low, high) = self.bounds();
+        let scale = SIZE_PX / (high.0 - low.0).max(high.1 - low.1).max(1.0);
+        let (_, height) = area.dim_in_pixel();
+        let px = |p: &Place| {
+            let x = (p.0 - low.0) * scale + MARGIN_PX;
+            let y = f64::from(height) - MARGIN_PX - (p.1 - low.1) * scale;
+            (x as i32, y as i32)
+        };
+        for link in &self.links {
+            area.draw(&PathElement::new(
+                link.iter().map(px).collect::<Vec<_>>(),
+                LANE.mix(0.4).stroke_width(2),
+            ))?;
+        }
+        for (shape, color) in &self.lanes {
+            let line: Vec<(i32, i32)> = shape.iter().map(px).collect();
+            area.draw(&PathElement::new(line.clone(), color.stroke_width(3)))?;
+            area.draw(&Polygon::new(arrow(&line), color.filled()))?;
+        }
+        let text = |place: (i32, i32), text: &str, color: RGBColor, size: u32| {
+            let style =
+                ("sans-serif", size).into_font().color(&color).pos(Pos::new(HPos::Center, VPos::Bottom));
+            area.draw(&Text::new(text.to_owned(), (place.0, place.1 - 6), style))
+        };
+        for (place, kind, name) in &self.points {
+            let color = if *kind == PointKind::Merge { MERGE } else { CROSSING };
+            area.draw(&Circle::new(px(place), 5, color.filled()))?;
+            // In a large network names would only cover each other.
+            if self.points.len() <= 30 && *kind == PointKind::Crossing {
+                text(px(place), name, color, 13)?;
+            }
+        }
+        for (place, name, color) in &self.labels {
+            text(px(place), name, *color, 15)?;
+        }
+        let legend = [
+            ("entrance", ENTRANCE),
+            ("lane", LANE),
+            ("merge", MERGE),
+            ("crossing", CROSSING),
+            ("exit", EXIT),
+        ];
+        for (at, (name, color)) in (0..).zip(legend) {
+            let y = 16 + 18 * at;
+            area.draw(&Rectangle::new([(10, y - 4), (22, y + 4)], color.filled()))?;
+            let style = ("sans-serif", 14).into_font().color(&BLACK).pos(Pos::new(HPos::Left, VPos::Center));
+            area.draw(&Text::new(name, (28, y), style))?;
+        }
+        area.present()
+    }
+}
+
+/// A small arrow in the middle of a line, in the direction of travel.
+fn arrow(line: &[(i32, i32)]) -> Vec<(i32, i32)> {
+    let at = (line.len() - 1) / 2;
+    let ((x0, y0), (x1, y1)) = (line[at], line[at + 1]);
+    let (dx, dy) = (f64::from(x1 - x0), f64::from(y1 - y0));
+    let length = dx.hypot(dy).max(1e-9);
+    let (ux, uy) = (dx / length, dy / length);
+    let middle = (f64::from(x0 + x1) / 2.0, f64::from(y0 + y1) / 2.0);
+    let place = |along: f64, aside: f64| {
+        let x = middle.0 + along * ux - aside * uy;
+        let y = middle.1 + along * uy + aside * ux;
+        (x as i32, y as i32)
+    };
+    if length < 14.0 {
+        vec![place(0.0, 0.0)]
+    } else {
+        vec![place(7.0, 0.0), place(-5.0, 5.0), place(-5.0, -5.0)]
+    }
+}
+
+/// The place at a share of a polyline's length.
+fn along(shape: &[Place], share: f64) -> Place {
+    let lengths: Vec<f64> = shape.windows(2).map(|w| (w[1].0 - w[0].0).hypot(w[1].1 - w[0].1)).collect();
+    let mut left = share.clamp(0.0, 1.0) * lengths.iter().sum::<f64>();
+    for (pair, length) in shape.windows(2).zip(&lengths) {
+        if left <= *length && *length > 0.0 {
+            let t = left / length;
+            return (pair[0].0 + t * (pair[1].0 - pair[0].0), pair[0].1 + t * (pair[1].1 - pair[0].1));
+        }
+        left -= length;
+    }
+    shape[shape.len() - 1]
+}
+
+/// A polyline of every segment of every zone: its shape, or else lanes from left to right, zones one behind the other
+/// and side by side where they do not lie on one way.
+fn layout(network: &Network) -> Vec<Vec<Vec<Place>>> {
+    let mut shapes: Vec<Vec<Vec<Place>>> = Vec::with_capacity(network.zones.len());
+    let mut free_m = 0.0;
+    for zone in &network.zones {
+        // Behind the zone upstream that is placed already; otherwise a row of its own.
+        let upstream = zone.segments.iter().enumerate().find_map(|(at, segment)| match segment.source {
+            Some(Source::Zone { zone, exit }) if (zone as usize) < shapes.len() => {
+                let there = &network.zones[zone as usize];
+                let path = there.paths.iter().find(|path| path.exit == exit)?;
+                let shape = &shapes[zone as usize][*path.segments.last()? as usize];
+                let link_m = there.exits[exit as usize].to.map_or(0.0, |to| to.link_m);
+                let end = shape[shape.len() - 1];
+                Some((at, (end.0 + link_m, end.1)))
+            }
+            _ => None,
+        });
+        let entrances: Vec<usize> =
+            (0..zone.segments.len()).filter(|&s| zone.segments[s].source.is_some()).collect();
+        let (first, origin) = upstream.unwrap_or((entrances[0], (0.0, free_m)));
+        if upstream.is_none() && zone.segments.iter().all(|s| s.shape.is_empty()) {
+            free_m -= APART_M * (entrances.len() as f64 + 1.0);
+        }
+        let longest_m = zone.longest_m();
+        let mut placed: Vec<Vec<Place>> = Vec::with_capacity(zone.segments.len());
+        for (at, segment) in zone.segments.iter().enumerate() {
+            if !segment.shape.is_empty() {
+                placed.push(segment.shape.iter().map(|&[x, y]| (x, y)).collect());
+                continue;
+            }
+            let path = zone
+                .paths
+                .iter()
+                .find(|p| p.segments.contains(&(at as u32)))
+                .expect("a path uses each segment");
+            let before = path.segments.iter().take_while(|&&s| s as usize != at);
+            let from_m: f64 =
+                before.map(|&s| zone.segments[s as usize].length_m).sum::<f64>() + longest_m - path.length_m;
+            let row = entrances.iter().position(|&e| e == at).unwrap_or(0) as f64;
+            let first_row = entrances.iter().position(|&e| e == first).unwrap_or(0) as f64;
+            let aside_m = if segment.source.is_some() { (row - first_row) * -APART_M } else { 0.0 };
+            let start = (origin.0 + from_m, origin.1 + aside_m);
+            placed.push(vec![start, (origin.0 + from_m + segment.length_m, origin.1)]);
+        }
+        shapes.push(placed);
+    }
+    shapes
+}

@@ -1,0 +1,305 @@
+//! Where the paths of a zone conflict.
+
+use crate::scenario::{Network, Zone, ZoneId};
+
+/// What happens at a conflict point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PointKind {
+    /// Paths come together and go on as one.
+    Merge,
+    /// Paths cross and part again.
+    Crossing,
+}
+
+/// A conflict point of a zone.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Point {
+    /// What happens there.
+    pub kind: PointKind,
+    /// Name of the crossing, or of the segment or exit that paths merge into.
+    pub name: String,
+    /// Extent of the conflict area along a path, m; 0 at a merge.
+    pub area_m: f64,
+}
+
+/// A path's passage of a conflict point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Use {
+    /// Index in [`Conflicts::points`].
+    pub point: u32,
+    /// Distance from the zone's origin on this path, m (the literature's L_k).
+    pub at_m: f64,
+    /// Lane on which the path passes it: paths that pass it on one lane follow each other there.
+    lane: u32,
+}
+
+/// A stretch that two paths have in common.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Run {
+    /// Where it begins on the path, m.
+    pub from_m: f64,
+    /// Where it ends on the path, m; infinite when it goes on behind a common exit.
+    pub to_m: f64,
+    /// Where it begins on the other path, m.
+    pub other_from_m: f64,
+}
+
+/// The conflicts of one zone.
+#[derive(Clone, Debug)]
+pub struct Conflicts {
+    points: Vec<Point>,
+    paths: Vec<PathConflicts>,
+    exits: Vec<Onward>,
+}
+
+#[derive(Clone, Debug)]
+struct PathConflicts {
+    length_m: f64,
+    exit: u32,
+    last_segment: u32,
+    /// Where it first meets paths of other entrances, m; infinite when it does not.
+    meets_from_m: f64,
+    /// Ascending by place.
+    uses: Vec<Use>,
+    /// Stretches of segments shared with other paths, by path.
+    shared: Vec<(u32, Run)>,
+}
+
+/// What is behind an exit.
+#[derive(Clone, Debug, Default)]
+struct Onward {
+    link_m: f64,
+    /// By path of the zone there: its segments and their lengths, m. Empty for paths of other entrances.
+    paths: Vec<Vec<(u32, f64)>>,
+}
+
+impl Conflicts {
+    /// The conflicts of all zones of a network.
+    pub fn of_all(network: &Network) -> Vec<Conflicts> {
+        (0..network.zones.len() as ZoneId).map(|zone| Conflicts::of(network, zone)).collect()
+    }
+
+    /// The conflicts of a zone.
+    pub fn of(network: &Network, zone: ZoneId) -> Conflicts {
+        let zone = &network.zones[zone as usize];
+        let paths = zone.paths.iter().map(|path| PathConflicts {
+            length_m: path.length_m,
+            exit: path.exit,
+            last_segment: *path.segments.last().expect("a path has segments"),
+            meets_from_m: f64::INFINITY,
+            uses: Vec::new(),
+            shared: Vec::new(),
+        });
+        let mut conflicts = Conflicts { points: Vec::new(), paths: paths.collect(), exits: Vec::new() };
+        conflicts.exits = zone
+            .exits
+            .iter()
+            .map(|exit| {
+                exit.to.map_or_else(Onward::default, |to| {
+                    let there = &network.zones[to.zone as usize];
+                    let segments = |path: &crate::scenario::Path| {
+                        let own = path.segments.iter().map(|&s| (s, there.segments[s as usize].length_m));
+                        if path.segments[0] == to.segment { own.collect() } else { Vec::new() }
+                    };
+                    Onward { link_m: to.link_m, paths: there.paths.iter().map(segments).collect() }
+                })
+            })
+            .collect();
+        conflicts.find_merges(zone);
+        conflicts.find_crossings(zone);
+        conflicts.find_shared(zone);
+        for path in &mut conflicts.paths {
+            path.uses.sort_by(|a, b| a.at_m.total_cmp(&b.at_m));
+            path.meets_from_m = path.uses.first().map_or(f64::INFINITY, |first| first.at_m);
+        }
+        conflicts
+    }
+
+    /// The conflict points.
+    pub fn points(&self) -> &[Point] {
+        &self.points
+    }
+
+    /// The conflict points on a path, in order.
+    pub fn uses(&self, path: u32) -> &[Use] {
+        &self.paths[path as usize].uses
+    }
+
+    /// Length of a path, m.
+    pub fn length_m(&self, path: u32) -> f64 {
+        self.paths[path as usize].length_m
+    }
+
+    /// The exit a path leads to.
+    pub fn exit(&self, path: u32) -> u32 {
+        self.paths[path as usize].exit
+    }
+
+    /// Where a path first meets others than those of its own lane, m; infinite when it does not.
+    pub fn meets_from_m(&self, path: u32) -> f64 {
+        self.paths[path as usize].meets_from_m
+    }
+
+    /// How far behind a path's end a vehicle of this length still stands in a conflict area of the zone, or may
+    /// count there for one that keeps `reach_m` at most, m; 0 or less when no crossing is near the end.
+    pub fn clears_behind_m(&self, path: u32, length_m: f64, reach_m: f64) -> f64 {
+        let path = &self.paths[path as usize];
+        let crossings =
+            path.uses.iter().filter(|u| self.points[u.point as usize].kind == PointKind::Crossing);
+        let clears = crossings.map(|u| u.at_m + self.points[u.point as usize].area_m + length_m + reach_m);
+        clears.fold(f64::NEG_INFINITY, f64::max) - path.length_m
+    }
+
+    fn find_merges(&mut self, zone: &Zone) {
+        // Where a segment begins to which paths come over different ones.
+        for (segment, shape) in (0..).zip(&zone.segments) {
+            let before = |path: &crate::scenario::Path| {
+                let at = path.segments.iter().position(|&s| s == segment)?;
+                Some(path.segments[at.checked_sub(1)?])
+            };
+            let first = zone.paths.iter().find_map(before);
+            if zone.paths.iter().filter_map(before).all(|s| Some(s) == first) {
+                continue;
+            }
+            let point = self.point(PointKind::Merge, &shape.name, 0.0);
+            for (path, own) in zone.paths.iter().zip(&mut self.paths) {
+                let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
+                let at_m = path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
+                own.uses.push(Use { point, at_m, lane: path.segments[at - 1] });
+            }
+        }
+        // Where paths end that leave by one exit and have not come together before.
+        for (exit, shape) in (0..).zip(&zone.exits) {
+            let mut leaving = self.paths.iter().filter(|path| path.exit == exit);
+            let first = leaving.next().map(|path| path.last_segment);
+            if leaving.all(|path| Some(path.last_segment) == first) {
+                continue;
+            }
+            let point = self.point(PointKind::Merge, &shape.name, 0.0);
+            for own in self.paths.iter_mut().filter(|path| path.exit == exit) {
+                own.uses.push(Use { point, at_m: own.length_m, lane: own.last_segment });
+            }
+        }
+    }
+
+    fn find_crossings(&mut self, zone: &Zone) {
+        for crossing in &zone.crossings {
+            let point = self.point(PointKind::Crossing, &crossing.name, crossing.length_m);
+            for &(segment, at_m) in &crossing.places {
+                for (path, own) in zone.paths.iter().zip(&mut self.paths) {
+                    let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
+                    let before_m: f64 =
+                        path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
+                    own.uses.push(Use { point, at_m: before_m + at_m, lane: segment });
+                }
+            }
+        }
+    }
+
+    fn find_shared(&mut self, zone: &Zone) {
+        let mut by_segment: Vec<Vec<u32>> = vec![Vec::new(); zone.segments.len()];
+        for (index, path) in (0..).zip(&zone.paths) {
+            path.segments.iter().for_each(|&s| by_segment[s as usize].push(index));
+        }
+        let starts = |path: &crate::scenario::Path| {
+            path.segments
+                .iter()
+                .scan(0.0, |at, &s| {
+                    let start = *at;
+                    *at += zone.segments[s as usize].length_m;
+                    Some(start)
+                })
+                .collect::<Vec<f64>>()
+        };
+        let all_starts: Vec<Vec<f64>> = zone.paths.iter().map(starts).collect();
+        for (index, path) in zone.paths.iter().enumerate() {
+            let mut others: Vec<u32> =
+                path.segments.iter().flat_map(|&s| by_segment[s as usize].iter().copied()).collect();
+            others.sort_unstable();
+            others.dedup();
+            for other in others.into_iter().filter(|&other| other as usize != index) {
+                let theirs = &zone.paths[other as usize];
+                let mut at = 0;
+                while at < path.segments.len() {
+                    let Some(place) = theirs.segments.iter().position(|s| *s == path.segments[at]) else {
+                        at += 1;
+                        continue;
+                    };
+                    let same = path.segments[at..].iter().zip(&theirs.segments[place..]);
+                    let count = same.take_while(|(a, b)| a == b).count();
+                    let from_m = all_starts[index][at];
+                    let (end, their_end) = (at + count, place + count);
+                    let goes_on = end == path.segments.len()
+                        && their_end == theirs.segments.len()
+                        && path.exit == theirs.exit;
+                    let to_m = match all_starts[index].get(end) {
+                        Some(&start) => start,
+                        None if goes_on => f64::INFINITY,
+                        None => path.length_m,
+                    };
+                    let run = Run { from_m, to_m, other_from_m: all_starts[other as usize][place] };
+                    self.paths[index].shared.push((other, run));
+                    at = end;
+                }
+            }
+        }
+    }
+
+    fn point(&mut self, kind: PointKind, name: &str, area_m: f64) -> u32 {
+        self.points.push(Point { kind, name: name.to_owned(), area_m });
+        self.points.len() as u32 - 1
+    }
+
+    /// The stretches that a vehicle on `path`, going on to `next_path` of the zone behind the exit, shares with
+    /// one on `other`, going on to `other_next`.
+    pub fn runs(
+        &self,
+        (path, next_path): (u32, u32),
+        (other, other_next): (u32, u32),
+        mut with: impl FnMut(Run),
+    ) {
+        let (own, theirs) = (&self.paths[path as usize], &self.paths[other as usize]);
+        let mut emit = |run: Run| {
+            let to_m =
+                if run.to_m == f64::INFINITY { self.parts_m(own, next_path, other_next) } else { run.to_m };
+            with(Run { to_m, ..run });
+        };
+        if path == other {
+            return emit(Run { from_m: 0.0, to_m: f64::INFINITY, other_from_m: 0.0 });
+        }
+        let from = own.shared.partition_point(|(with, _)| *with < other);
+        for (_, run) in own.shared[from..].iter().take_while(|(with, _)| *with == other) {
+            emit(*run);
+        }
+        if own.exit == theirs.exit && own.last_segment != theirs.last_segment {
+            let (from_m, other_from_m) = (own.length_m, theirs.length_m);
+            emit(Run { from_m, to_m: f64::INFINITY, other_from_m });
+        }
+    }
+
+    /// Where two vehicles that leave by one exit part, m on the path; infinite when they do not.
+    fn parts_m(&self, path: &PathConflicts, next: u32, other_next: u32) -> f64 {
+        if next == other_next {
+            return f64::INFINITY;
+        }
+        let onward = &self.exits[path.exit as usize];
+        let (Some(a), Some(b)) = (onward.paths.get(next as usize), onward.paths.get(other_next as usize))
+        else {
+            return f64::INFINITY;
+        };
+        let common_m: f64 = a.iter().zip(b).take_while(|(a, b)| a.0 == b.0).map(|(a, _)| a.1).sum();
+        path.length_m + onward.link_m + common_m
+    }
+}
+
+impl Use {
+    /// The lane on which the path passes the point.
+    pub(super) fn lane(&self) -> u32 {
+        self.lane
+    }
+
+    /// Whether two paths pass the point on one lane, so that their vehicles follow each other there.
+    pub fn on_lane_of(&self, other: &Use) -> bool {
+        self.lane == other.lane
+    }
+}

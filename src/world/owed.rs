@@ -1,0 +1,174 @@
+//! What the members of a zone owe to whom, worked out from its order at its events.
+
+use super::car::Car;
+use super::role::World;
+use crate::conflict::{Duties, Duty, DutyKind, Row};
+use crate::scenario::{PassingOrder, Scenario, VehicleParams};
+use crate::shield::{RESERVE_M, Shield, yielding_slack_m};
+use ipc_schemas::Assignment;
+
+/// A duty of a member, its partner being the index of a car.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Owed {
+    pub duty: Duty,
+    /// Who the partner is; its index changes from event to event.
+    pub partner: u32,
+    pub standing: Standing,
+}
+
+/// Whether the vehicle was safe toward its partner when it came to owe it something: only then can the
+/// shield hold it to its duty.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Standing {
+    /// No shield has looked yet.
+    Unknown,
+    Safe,
+    Unsafe,
+}
+
+/// The passing order of a zone that is not served in order of entry: vehicles, first to last.
+#[derive(Debug, Default)]
+pub(super) struct Order {
+    known: Vec<u32>,
+    /// What the coordinator has said for the present step.
+    proposed: Option<Vec<u32>>,
+    refused: u32,
+}
+
+/// What deriving duties takes; kept for its allocations.
+#[derive(Debug, Default)]
+pub(super) struct Deriving {
+    duties: Duties,
+    rows: Vec<Row>,
+    before: Vec<(u32, Owed)>,
+    owed: Vec<Owed>,
+    order: Vec<u32>,
+}
+
+impl World {
+    /// Takes what a coordinator has decided for the present step: the passing orders of its zones. The duties are
+    /// worked out from these, whatever else the assignments say.
+    ///
+    /// Zones whose order is that of entry need nobody to say so.
+    pub fn coordinate(&mut self, assignments: &[Assignment]) {
+        for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
+            let zone = group[0].zone;
+            let shape = self.scenario.network.zones.get(zone as usize);
+            if shape.is_none_or(|shape| shape.order == PassingOrder::Fifo) {
+                continue;
+            }
+            let mut ranks: Vec<(u32, u32)> = group.iter().map(|a| (a.rank, a.vehicle)).collect();
+            ranks.sort_unstable();
+            ranks.dedup();
+            self.orders.entry(zone).or_default().proposed =
+                Some(ranks.into_iter().map(|(_, vehicle)| vehicle).collect());
+        }
+    }
+
+    /// Brings the order of a zone that is not served in order of entry up to date: as proposed, if that is an order of
+    /// its members that puts nobody in danger; otherwise as it was, with those that have entered since at the end.
+    fn adopt_order(&mut self, scenario: &Scenario, zone: usize) {
+        let first = self.zones[zone].first();
+        let members = &self.cars[zone][first..];
+        let Order { known, proposed, refused } = self.orders.entry(zone as u32).or_default();
+        known.retain(|vehicle| members.iter().any(|car| car.vehicle == *vehicle));
+        for car in members {
+            if !known.contains(&car.vehicle) {
+                known.push(car.vehicle);
+            }
+        }
+        let Some(proposed) = proposed.take().filter(|proposed| proposed != known) else { return };
+        let car = |vehicle: u32| members.iter().find(|car| car.vehicle == vehicle);
+        let is_whole =
+            proposed.len() == known.len() && proposed.iter().all(|vehicle| known.contains(vehicle));
+        let place = |vehicle: u32| known.iter().position(|known| *known == vehicle);
+        let conflicts = &self.conflicts[zone];
+        let duties = &mut self.scratch.duties.duties;
+        // Whoever is to let somebody pass that it was to pass before must be able to.
+        let is_safe = is_whole
+            && proposed.iter().enumerate().all(|(at, &second)| {
+                let before = proposed[..at].iter().filter(|&&other| place(other) > place(second));
+                let mut before = before.filter_map(|&other| car(other));
+                before.all(|first| {
+                    let second = car(second).expect("the order is one of members");
+                    let row =
+                        |car: &Car| row(car, &self.kinds[usize::from(car.kind)], &scenario.vehicle, 0, false);
+                    let shield = Shield::new(&self.kinds[usize::from(second.kind)], scenario.dt_s());
+                    yielding_slack_m(&shield, conflicts, duties, &row(first), &row(second)) >= RESERVE_M
+                })
+            });
+        if is_safe {
+            *known = proposed;
+        } else {
+            *refused += 1;
+        }
+    }
+
+    /// How often an order was proposed that the world did not adopt.
+    pub(super) fn refused_orders(&self, zone: usize) -> u32 {
+        self.orders.get(&(zone as u32)).map_or(0, |order| order.refused)
+    }
+
+    /// Works out who owes what in the zones whose vehicles have changed.
+    pub(super) fn derive_duties(&mut self, scenario: &Scenario) {
+        for at in 0..self.events.len() {
+            self.derive_in(scenario, self.events[at] as usize);
+        }
+    }
+
+    fn derive_in(&mut self, scenario: &Scenario, zone: usize) {
+        let is_fifo = scenario.network.zones[zone].order == PassingOrder::Fifo;
+        if !is_fifo {
+            self.adopt_order(scenario, zone);
+        }
+        let Deriving { duties, rows, before, owed, order } = &mut self.scratch.duties;
+        let first = self.zones[zone].first();
+        let cars = &mut self.cars[zone];
+        order.clear();
+        // Members are in order of entry.
+        order.extend(first as u32..cars.len() as u32);
+        if let (false, Some(Order { known, .. })) = (is_fifo, self.orders.get(&(zone as u32))) {
+            let place = |at: u32| known.iter().position(|vehicle| *vehicle == cars[at as usize].vehicle);
+            order.sort_by_key(|at| place(*at));
+        }
+        before.clear();
+        for car in &cars[first..] {
+            let own = &self.owed[zone][car.owed.0 as usize..car.owed.1 as usize];
+            before.extend(own.iter().map(|owed| (car.vehicle, *owed)));
+        }
+        rows.clear();
+        let kinds = &self.kinds;
+        rows.extend((0..first as u32).chain(order.iter().copied()).map(|at| {
+            let car = &cars[at as usize];
+            row(car, &kinds[usize::from(car.kind)], &scenario.vehicle, at, (at as usize) < first)
+        }));
+        duties.derive(&self.conflicts[zone], rows);
+        owed.clear();
+        for (place, &at) in order.iter().enumerate() {
+            let from = owed.len() as u32;
+            for duty in duties.of(first + place) {
+                let partner = cars[duty.partner as usize].vehicle;
+                let vehicle = cars[at as usize].vehicle;
+                let known = before
+                    .iter()
+                    .find(|(of, old)| *of == vehicle && is_same(&old.duty, old.partner, duty, partner));
+                let standing = known.map_or(Standing::Unknown, |(_, old)| old.standing);
+                owed.push(Owed { duty: *duty, partner, standing });
+            }
+            cars[at as usize].owed = (from, owed.len() as u32);
+        }
+        self.owed.set(zone, owed);
+        self.order.set(zone, order);
+    }
+}
+
+/// Whether two duties of one vehicle are the same, seen at two events: a partner at a merge has become the leader.
+fn is_same(old: &Duty, old_partner: u32, new: &Duty, new_partner: u32) -> bool {
+    let crosses = |duty: &Duty| (duty.kind == DutyKind::Cross).then_some(duty.point);
+    old_partner == new_partner && crosses(old) == crosses(new)
+}
+
+fn row(car: &Car, own: &VehicleParams, reference: &VehicleParams, id: u32, has_left: bool) -> Row {
+    let Car { path, next_path, x_m, v_mps, .. } = *car;
+    Row { path, next_path, x_m, v_mps, has_left, ..Row::new(own, reference, id) }
+}
