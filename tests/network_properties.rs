@@ -2,9 +2,9 @@
 
 use control_zones::lockstep::{LockstepError, in_process::InProcess};
 use control_zones::scenario::{
-    Approach, Baseline, ControlParams, Demand, Exit, FeConditions, FlowPolicy, Network, Poisson,
-    PositionFeedback, RatePeriod, ReferenceLaw, Replan, Road, SafetyRows, Scenario, Segment, Solver, Source,
-    SpeedDistribution, VehicleParams, Zone,
+    Baseline, ControlParams, Demand, Downstream, Exit, FeConditions, FlowPolicy, LawKind, Network, Observed,
+    PassingOrder, Path, Poisson, PositionFeedback, RatePeriod, ReferenceLaw, Replan, Road, SafetyRows,
+    Scenario, Segment as Lane, Solver, Source, SpeedDistribution, VehicleKind, VehicleParams, Zone,
 };
 use control_zones::world::{World, WorldSummary};
 use ipc_schemas::{NO_ZONE, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState};
@@ -17,6 +17,15 @@ const DEMAND_S: f64 = 90.0;
 const END_S: f64 = 400.0;
 /// -u_min, m/s^2.
 const BRAKING_MPS2: f64 = 4.0;
+const VEHICLE: VehicleParams = VehicleParams {
+    u_min_mps2: -BRAKING_MPS2,
+    u_max_mps2: 4.0,
+    v_min_mps: 0.0,
+    v_max_mps: 30.0,
+    length_m: 4.5,
+    reaction_time_s: 1.8,
+    standstill_gap_m: 0.0,
+};
 const CASES: u32 = 128;
 
 #[derive(Clone, Debug)]
@@ -35,7 +44,7 @@ fn flow() -> impl Strategy<Value = FlowPolicy> {
         (10.0..22.0).prop_map(Baseline::Given),
         Just(Baseline::Optimal((10..=20).map(f64::from).collect())),
     ];
-    let segment = prop_oneof![Just(Segment::Whole), (20.0..80.0).prop_map(Segment::First)];
+    let segment = prop_oneof![Just(Observed::Whole), (20.0..80.0).prop_map(Observed::First)];
     prop_oneof![
         Just(FlowPolicy::None),
         (8.0..22.0).prop_map(|terminal_mps| FlowPolicy::Fixed { terminal_mps }),
@@ -124,11 +133,11 @@ fn control() -> impl Strategy<Value = ControlParams> {
     )
 }
 
-/// Puts zones together: each leads to one further down the list that still has an approach to spare, or
-/// out; approaches that nobody leads to are entry roads.
+/// Puts zones together: each leads to one further down the list that still has an entrance to spare, or
+/// out; entrances that nobody leads to are entry roads.
 fn network(raw: &[RawZone]) -> Network {
     let mut sources: Vec<Vec<Option<Source>>> = raw.iter().map(|z| vec![None; z.lengths_m.len()]).collect();
-    let mut exits = vec![Exit::Out; raw.len()];
+    let mut exits: Vec<Option<Downstream>> = vec![None; raw.len()];
     for (i, zone) in raw.iter().enumerate() {
         let later = raw.len() - i - 1;
         // Mostly the next zone, so that corridors are as frequent as trees; sometimes out.
@@ -137,49 +146,48 @@ fn network(raw: &[RawZone]) -> Network {
             continue;
         }
         if let Some(path) = sources[down].iter().position(Option::is_none) {
-            sources[down][path] = Some(Source::Zone(i as u32));
-            exits[i] = Exit::Zone {
-                zone: down as u32,
-                path: path as u32,
-                link_m: zone.link_m,
-                link_speed_mps: 15.0,
-            };
+            sources[down][path] = Some(Source::Zone { zone: i as u32, exit: 0 });
+            let (zone, segment, link_m) = (down as u32, path as u32, zone.link_m);
+            exits[i] = Some(Downstream { zone, segment, link_m, link_speed_mps: 15.0 });
         }
     }
     let mut roads = Vec::new();
-    let zones = raw
-        .iter()
-        .enumerate()
-        .map(|(i, zone)| Zone {
+    let mut zones = Vec::new();
+    for (i, zone) in raw.iter().enumerate() {
+        let (mut segments, mut paths) = (Vec::new(), Vec::new());
+        for (at, &length_m) in zone.lengths_m.iter().enumerate() {
+            let source = sources[i][at].unwrap_or_else(|| {
+                let road = roads.len() as u32;
+                roads.push(Road {
+                    name: format!("r{road}"),
+                    zone: i as u32,
+                    segment: at as u32,
+                    demand: Demand::Poisson(zone.demands[at].clone()),
+                    routes: Vec::new(),
+                });
+                Source::Road(road)
+            });
+            let name = format!("a{at}");
+            segments.push(Lane { name: name.clone(), length_m, source: Some(source), shape: Vec::new() });
+            paths.push(Path { name, segments: vec![at as u32], exit: 0, length_m, share: 1.0 });
+        }
+        // Feedback needs a zone downstream, as the loader demands.
+        let flow = match (&zone.flow, exits[i]) {
+            (FlowPolicy::Feedback { .. } | FlowPolicy::MeanSpeed { .. }, None) => {
+                FlowPolicy::Fixed { terminal_mps: 18.5 }
+            }
+            (flow, _) => flow.clone(),
+        };
+        zones.push(Zone {
             name: format!("z{i}"),
-            approaches: zone
-                .lengths_m
-                .iter()
-                .enumerate()
-                .map(|(path, &length_m)| {
-                    let source = sources[i][path].unwrap_or_else(|| {
-                        let road = roads.len() as u32;
-                        roads.push(Road {
-                            name: format!("r{road}"),
-                            zone: i as u32,
-                            path: path as u32,
-                            demand: Demand::Poisson(zone.demands[path].clone()),
-                        });
-                        Source::Road(road)
-                    });
-                    Approach { name: format!("a{path}"), length_m, source }
-                })
-                .collect(),
-            exit: exits[i],
-            // Feedback needs a zone downstream, as the loader demands.
-            flow: match (&zone.flow, exits[i]) {
-                (FlowPolicy::Feedback { .. } | FlowPolicy::MeanSpeed { .. }, Exit::Out) => {
-                    FlowPolicy::Fixed { terminal_mps: 18.5 }
-                }
-                (flow, _) => flow.clone(),
-            },
-        })
-        .collect();
+            segments,
+            paths,
+            exits: vec![Exit { name: "exit".to_owned(), to: exits[i], flow }],
+            crossings: Vec::new(),
+            order: PassingOrder::Fifo,
+            law: LawKind::Ocbf,
+        });
+    }
     Network { zones, roads }
 }
 
@@ -196,15 +204,8 @@ fn scenario() -> impl Strategy<Value = Scenario> {
             max_vehicles: None,
             max_time_s: END_S,
             network: network(&raw),
-            vehicle: VehicleParams {
-                u_min_mps2: -BRAKING_MPS2,
-                u_max_mps2: 4.0,
-                v_min_mps: 0.0,
-                v_max_mps: 30.0,
-                length_m: 4.5,
-                reaction_time_s: 1.8,
-                standstill_gap_m: 0.0,
-            },
+            vehicle: VEHICLE,
+            fleet: vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: VEHICLE }],
             control,
             beta: 2.0 / 3.0,
         },
@@ -241,7 +242,7 @@ fn check_frame(
             if !on_link {
                 let just = r.entry_time_s > now_s - scenario.dt_s() - 1e-9;
                 prop_assert!(left || !entered || just, "step {step}: entered long ago: {r:?}");
-                let length_m = scenario.network.zones[r.zone as usize].approaches[r.path as usize].length_m;
+                let length_m = scenario.network.zones[r.zone as usize].paths[r.path as usize].length_m;
                 if left {
                     prop_assert!(r.x_m >= length_m - 1e-9, "step {step}: index 0 before the end: {r:?}");
                 } else {
@@ -293,9 +294,9 @@ impl Pairs {
     ///   with a negative margin asks for a return to the distance, not for a stop before the leader: with
     ///   k1 = 0.5, one was 0.1 m past a standing leader at L/4 + 4 m, still braking.
     fn check(&mut self, scenario: &Scenario, step: u64, zone: &[VehicleState]) -> Result<(), TestCaseError> {
-        let approaches = &scenario.network.zones[zone[0].zone as usize].approaches;
+        let paths = &scenario.network.zones[zone[0].zone as usize].paths;
         for (i, r) in zone.iter().enumerate().filter(|(_, r)| r.flags & STATE_LEFT == 0) {
-            let length_m = approaches[r.path as usize].length_m;
+            let length_m = paths[r.path as usize].length_m;
             if r.flags & STATE_ENTERED != 0 && r.x_m + stopping_m(r.v_mps) > length_m {
                 self.too_fast.insert(r.zone);
             }

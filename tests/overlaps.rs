@@ -99,7 +99,7 @@ impl Oracle {
     fn length_m(scenario: &Scenario, place: Place) -> f64 {
         match place {
             Place::Approach(zone, path) => {
-                scenario.network.zones[zone as usize].approaches[path as usize].length_m
+                scenario.network.zones[zone as usize].paths[path as usize].length_m
             }
             Place::Link(zone) => match scenario.network.zones[zone as usize].exit {
                 control_zones::scenario::Exit::Zone { link_m, .. } => link_m,

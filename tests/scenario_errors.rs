@@ -115,7 +115,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "[control]",
         "[[faults.sensors]]\nkind = \"frozen\"\nposition_m = 2\n[control]",
-        "s.toml:12: faults.sensors.0.position_m = 2: unknown key; expected one of kind, zones, approaches, fraction, from_s, until_s",
+        "s.toml:12: faults.sensors.0.position_m = 2: unknown key; expected one of kind, zones, paths, fraction, from_s, until_s",
     ),
     (
         "[control]",
@@ -124,8 +124,8 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     ),
     (
         "[control]",
-        "[[faults.stalls]]\napproaches = [\"second.c\"]\n[control]",
-        "s.toml:11: faults.stalls.0.approaches.0 = \"second.c\": expected one of a, b",
+        "[[faults.stalls]]\npaths = [\"second.c\"]\n[control]",
+        "s.toml:11: faults.stalls.0.paths.0 = \"second.c\": expected one of a, b",
     ),
     (
         "dt_s = 0.1",
@@ -585,8 +585,8 @@ const SET_CASES: &[(&str, &str)] = &[
         "--set faults.stalls=[{zones=[\"frist\"]}]: faults.stalls.0.zones.0 = \"frist\": expected one of first, second; did you mean first?",
     ),
     (
-        "faults.stalls=[{zones=[\"second\"],approaches=[\"second.b\"]}]",
-        "--set faults.stalls=[{zones=[\"second\"],approaches=[\"second.b\"]}]: faults.stalls.0.approaches = [\"second.b\"]: an approach is named twice; expected each once",
+        "faults.stalls=[{zones=[\"second\"],paths=[\"second.b\"]}]",
+        "--set faults.stalls=[{zones=[\"second\"],paths=[\"second.b\"]}]: faults.stalls.0.paths = [\"second.b\"]: an approach is named twice; expected each once",
     ),
     ("dt_s", "--set dt_s: no '='; expected key=value"),
     ("=1", "--set =1: empty key; expected a dotted key such as end.vehicles"),
@@ -826,14 +826,14 @@ fn sets_reach_what_they_name() {
         &["zones.first.flow.terminal_mps=12", "zones.0.flow.policy=fixed"],
         &["zones.first.flow={policy=\"fixed\",terminal_mps=12}"],
     ] {
-        assert_eq!(with(sets).network.zones[0].flow, fixed, "{sets:?}");
+        assert_eq!(with(sets).network.zones[0].exits[0].flow, fixed, "{sets:?}");
     }
-    let feedback = with(&["zones.first.flow.baseline_mps=optimal"]).network.zones[0].flow.clone();
+    let feedback = with(&["zones.first.flow.baseline_mps=optimal"]).network.zones[0].exits[0].flow.clone();
     let FlowPolicy::Feedback { baseline: Baseline::Optimal(speeds), segment, min_mps, .. } = feedback else {
         panic!("{feedback:?}")
     };
     assert_eq!((speeds.len(), speeds[0], speeds[10]), (11, 10.0, 20.0));
-    assert_eq!((segment, min_mps), (Segment::First(50.0), 5.0));
+    assert_eq!((segment, min_mps), (Observed::First(50.0), 5.0));
     // alpha in place of the file's beta; a trace in place of the file's rates.
     assert_eq!(with(&["objective.alpha=0.0625"]).beta, 8.0 / 15.0);
     let Demand::Trace(rows) = &with(&["roads.north.demand.trace=arrivals.csv"]).network.roads[1].demand
@@ -856,12 +856,12 @@ fn faults_are_read_with_their_defaults() {
     assert_eq!(with(&[]).faults, None);
     assert_eq!(with(&["faults={}"]).faults, None);
     let whole = Span { from_s: 0.0, until_s: 1e9 };
-    let everybody = Scope { approaches: None, fraction: 1.0 };
+    let everybody = Scope { paths: None, fraction: 1.0 };
     let faults = with(&[
         "faults.noise.speed_sd_mps=0.2",
         "faults.commands.delay_steps=2",
         "faults.sensors=[{kind=\"frozen\"},{kind=\"bias\",speed_mps=-1,fraction=0.5,zones=[\"second\"]}]",
-        "faults.stalls=[{from_s=1,until_s=2.5,approaches=[\"second.b\",\"first.a\"]}]",
+        "faults.stalls=[{from_s=1,until_s=2.5,paths=[\"second.b\",\"first.a\"]}]",
     ]);
     let expected = Faults {
         noise: Some(Noise { position_sd_m: 0.0, speed_sd_mps: 0.2, span: whole }),
@@ -869,13 +869,13 @@ fn faults_are_read_with_their_defaults() {
             SensorFault { kind: SensorKind::Frozen, scope: everybody, span: whole },
             SensorFault {
                 kind: SensorKind::Bias { position_m: 0.0, speed_mps: -1.0 },
-                scope: Scope { approaches: Some(vec![(1, 0), (1, 1)]), fraction: 0.5 },
+                scope: Scope { paths: Some(vec![(1, 0), (1, 1)]), fraction: 0.5 },
                 span: whole,
             },
         ],
         commands: Some(CommandFaults { loss: 0.0, delay_steps: 2, delay_probability: 1.0, span: whole }),
         stalls: vec![Stall {
-            scope: Scope { approaches: Some(vec![(0, 0), (1, 1)]), fraction: 1.0 },
+            scope: Scope { paths: Some(vec![(0, 0), (1, 1)]), fraction: 1.0 },
             span: Span { from_s: 1.0, until_s: 2.5 },
         }],
     };

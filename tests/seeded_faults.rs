@@ -77,7 +77,7 @@ const EVERYTHING: [&str; 4] = [
     "faults.commands={loss=0.05,delay_steps=2,delay_probability=0.1}",
     "faults.sensors=[{kind=\"bias\",fraction=0.2,position_m=2,speed_mps=-0.5},\
      {kind=\"frozen\",zones=[\"merge-1\"],from_s=60,until_s=65}]",
-    "faults.stalls=[{approaches=[\"merge-2.main\"],from_s=80,until_s=82}]",
+    "faults.stalls=[{paths=[\"merge-2.main\"],from_s=80,until_s=82}]",
 ];
 
 #[test]
@@ -330,7 +330,8 @@ fn a_fraction_of_the_vehicles_is_the_same_for_life() {
 
 #[test]
 fn a_frozen_sensor_repeats_what_it_said_first() {
-    let frozen = "faults.sensors=[{kind=\"frozen\",approaches=[\"merge-1.main\",\"merge-2.merge\"],from_s=30,until_s=60}]";
+    let frozen =
+        "faults.sensors=[{kind=\"frozen\",paths=[\"merge-1.main\",\"merge-2.merge\"],from_s=30,until_s=60}]";
     let noise = EVERYTHING[0];
     let noisy = scripted_run(&scenario("two-merges", 1, &[noise]), 900).0;
     let (said, summary) = scripted_run(&scenario("two-merges", 1, &[noise, frozen]), 900);
@@ -408,8 +409,8 @@ fn a_vehicle_that_hears_nothing_keeps_its_acceleration() {
 }
 
 #[test]
-fn a_stall_reaches_its_approaches_only() {
-    let set = "faults.stalls=[{approaches=[\"merge-1.merge\"],from_s=20,until_s=40}]";
+fn a_stall_reaches_its_paths_only() {
+    let set = "faults.stalls=[{paths=[\"merge-1.merge\"],from_s=20,until_s=40}]";
     let frames = scripted_run(&scenario("two-merges", 1, &[set]), 500).0;
     let checked = each_step(&frames, |step, r| {
         let is_silent = (200..400).contains(&step) && (r.zone, r.path) == (0, 1);

@@ -67,39 +67,36 @@ class Ocbf:
 
     def __call__(self, zone):
         fields = (zone.vehicle, zone.x, zone.v, zone.entry_time, zone.entry_speed, zone.length, zone.terminal)
-        ahead = zip(zone.ahead_x, zone.ahead_v, zone.ahead_u)
-        merge = zip(zone.merge_x, zone.merge_v, zone.merge_u, zone.merge_at)
         u = numpy.empty(len(zone))
         for k, (vehicle, x, v, t0, v0, length, w) in enumerate(zip(*fields)):
             w = None if math.isnan(w) else w
             key = zone.zone, int(vehicle)
-            u[k] = self.drive(key, zone.time, x, v, t0, v0, length, w, next(ahead), next(merge))
+            u[k] = self.drive(key, zone.time, x, v, t0, v0, length, w, zone.partners[k])
         present = {(zone.zone, int(i)) for i in zone.vehicle}
         self.plans = {key: p for key, p in self.plans.items() if key[0] != zone.zone or key in present}
         return u
 
-    def drive(self, key, time, x, v, t0, v0, length, w, ahead, merge):
+    def drive(self, key, time, x, v, t0, v0, length, w, partners):
         p = self.p
         phi, u_min = p.reaction_time_s, p.u_min_mps2
         rows = []  # (coefficient, bound): coefficient * u <= bound
         good = True
-        xp, vp, up = ahead
-        if not math.isnan(xp):
-            b = xp - x - phi * v - p.standstill_gap_m
-            reserve = vp - v - phi * u_min
-            bound = vp - v + p.k_rear_end_per_s * b
-            good = good and b >= 0 and phi * u_min <= bound and reserve >= 0
-            rows += [(phi, bound), (1.0, up + p.k_rear_end_per_s * reserve)]
-        xc, vc, uc, at = merge
-        if not math.isnan(xc):
-            phi2 = phi / at
-            b = xc - x - phi2 * x * v - p.standstill_gap_m
-            drift = vc - v - phi2 * v * v
+        for kind, _, xp, vp, up, at, gap in partners:
+            if kind == s.CONSTRAINT_REAR_END:
+                b = xp - x - phi * v - gap
+                reserve = vp - v - phi * u_min
+                bound = vp - v + p.k_rear_end_per_s * b
+                good = good and b >= 0 and phi * u_min <= bound and reserve >= 0
+                rows += [(phi, bound), (1.0, up + p.k_rear_end_per_s * reserve)]
+                continue
+            phi2 = phi / at  # a merge or a crossing, by its own distance
+            b = xp - x - phi2 * x * v - gap
+            drift = vp - v - phi2 * v * v
             reserve = drift - phi2 * x * u_min
             bound = drift + p.k_merge_per_s * b
             good = good and b >= 0 and phi2 * x * u_min <= bound and reserve >= 0
             rows += [(phi2 * x, bound)]
-            rows += [(1 + 2 * phi2 * v, uc - phi2 * v * u_min + p.k_merge_per_s * reserve)]
+            rows += [(1 + 2 * phi2 * v, up - phi2 * v * u_min + p.k_merge_per_s * reserve)]
         plan = self.plans.get(key)
         if plan is None and not good and x <= p.fe_fraction * length:
             return u_min

@@ -7,7 +7,7 @@
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{DefaultSettingsBuilder, DefaultSolver, IPSolver, SolverStatus, SupportedConeT};
 use control_zones_plugin::schemas::RunSpec;
-use control_zones_plugin::{Controller, Step, Vehicle, run};
+use control_zones_plugin::{Controller, PartnerKind, Step, Vehicle, run};
 
 const HORIZON: usize = 15;
 const STEP_S: f64 = 0.4;
@@ -74,7 +74,11 @@ fn plan(spec: &RunSpec, vehicle: &Vehicle<'_>) -> Option<f64> {
         for k in 1..=HORIZON {
             let t = k as f64 * STEP_S;
             // A merging partner is owed the whole distance only at the conflict point (paper: phi x / L).
-            let share = if partner.merges { ((x + v * t) / partner.conflict_m).min(1.0) } else { 1.0 };
+            let share = if partner.kind != PartnerKind::RearEnd {
+                ((x + v * t) / partner.conflict_m).min(1.0)
+            } else {
+                1.0
+            };
             let phi = spec.reaction_time_s * share;
             let (px, pv) = (position(k), speed(k));
             let mut row: [f64; HORIZON + 1] = std::array::from_fn(|j| px[j] + phi * pv[j]);

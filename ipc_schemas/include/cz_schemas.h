@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0x3e9f1a13b126324d)
+#define CZ_SCHEMA_HASH UINT64_C(0x7e50f4f5fb4edbd2)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -47,26 +47,36 @@
 
 /** No vehicle: the value of a vehicle field that names nobody. */
 #define CZ_NO_VEHICLE UINT32_C(4294967295)
-/** No zone: a vehicle between zones, on a plain link. */
+/** No zone: a vehicle between zones, on a plain link, or a way that leads out of the network. */
 #define CZ_NO_ZONE UINT32_C(4294967295)
-/** `cz_vehicle_state_t.kind`: a connected automated vehicle, driven by a controller. */
-#define CZ_KIND_CAV UINT16_C(0)
-/** `cz_vehicle_state_t.kind`: a human-driven vehicle (reserved; no v1 world sends one). */
-#define CZ_KIND_HUMAN UINT16_C(1)
+/** No path: a way that leads out of the network. */
+#define CZ_NO_PATH UINT32_C(4294967295)
+/** No link: a vehicle in a zone. */
+#define CZ_NO_LINK UINT32_C(4294967295)
 /** `cz_vehicle_state_t.flags`: entered the zone during the step just ended (an event of the zone). */
 #define CZ_STATE_ENTERED UINT16_C(1)
-/** `cz_vehicle_state_t.flags`: index 0 of the zone, the vehicle that left it last. Not to be
- *  commanded. */
+/** `cz_vehicle_state_t.flags`: has left the zone and still counts in it (index 0 of the paper). Not
+ *  to be commanded. */
 #define CZ_STATE_LEFT UINT16_C(2)
-/** `cz_vehicle_state_t.flags`: left the zone during the step just ended (an event of the zone). */
+/** `cz_vehicle_state_t.flags`: somebody left the zone during the step just ended (an event of the
+ *  zone); set in all its records that have `CZ_STATE_LEFT`. */
 #define CZ_STATE_LEFT_NOW UINT16_C(4)
+/** `cz_vehicle_state_t.flags`: driven by a human. Not to be commanded. Reserved: no world sends it
+ *  yet. */
+#define CZ_STATE_HUMAN UINT16_C(8)
 
 /** `cz_assignment_t.kind`: no partner; the record only carries the terminal speed. */
 #define CZ_CONSTRAINT_NONE UINT16_C(0)
-/** `cz_assignment_t.kind`: the partner drives ahead on the same path (paper: i_p). */
+/** `cz_assignment_t.kind`: the partner drives ahead on the way the two share (paper: i_p). */
 #define CZ_CONSTRAINT_REAR_END UINT16_C(1)
-/** `cz_assignment_t.kind`: the partner passes the shared conflict point first (paper: i-1). */
+/** `cz_assignment_t.kind`: the partner passes the merge first (paper: i-1). Behind it, it is the
+ *  leader. */
 #define CZ_CONSTRAINT_MERGE UINT16_C(2)
+/** `cz_assignment_t.kind`: the partner crosses first. Nothing is owed once the vehicle has reached
+ *  the crossing. */
+#define CZ_CONSTRAINT_CROSS UINT16_C(3)
+/** `cz_assignment_t.point`: none; toward a leader. */
+#define CZ_NO_POINT UINT32_C(4294967295)
 /** `cz_assignment_t.flags`: the terminal speed is free; `terminal_speed_mps` is 0 and means
  *  nothing. */
 #define CZ_ASSIGNMENT_FREE_TERMINAL UINT16_C(1)
@@ -130,8 +140,8 @@
 /** `cz_attach_reply_t.status`: the request names a phase there is not. */
 #define CZ_ATTACH_BAD_PHASE UINT32_C(7)
 
-/** `cz_approach_spec_t.flags`: the controller that asked drives this approach. */
-#define CZ_APPROACH_OWN UINT32_C(1)
+/** `cz_path_spec_t.flags`: the controller that asked drives this path. */
+#define CZ_PATH_OWN UINT32_C(1)
 /** `cz_run_spec_t.law_flags`: the reference trajectory follows the condition as the paper prints
  *  it. */
 #define CZ_LAW_AS_PRINTED UINT32_C(1)
@@ -180,15 +190,16 @@
 
 /* Names under which the transport registers the record types. */
 #define CZ_TYPE_NAME_FRAME_HEADER "cz.FrameHeader.v1"
-#define CZ_TYPE_NAME_VEHICLE_STATE "cz.VehicleState.v1"
-#define CZ_TYPE_NAME_ASSIGNMENT "cz.Assignment.v1"
+#define CZ_TYPE_NAME_VEHICLE_STATE "cz.VehicleState.v2"
+#define CZ_TYPE_NAME_ASSIGNMENT "cz.Assignment.v2"
 #define CZ_TYPE_NAME_ZONE_SUMMARY "cz.ZoneSummary.v1"
-#define CZ_TYPE_NAME_VEHICLE_COMMAND "cz.VehicleCommand.v1"
+#define CZ_TYPE_NAME_VEHICLE_COMMAND "cz.VehicleCommand.v2"
 #define CZ_TYPE_NAME_MEMBER "cz.Member.v1"
 #define CZ_TYPE_NAME_ATTACH_REQUEST "cz.AttachRequest.v1"
 #define CZ_TYPE_NAME_ATTACH_REPLY "cz.AttachReply.v1"
-#define CZ_TYPE_NAME_RUN_SPEC "cz.RunSpec.v1"
-#define CZ_TYPE_NAME_APPROACH_SPEC "cz.ApproachSpec.v1"
+#define CZ_TYPE_NAME_RUN_SPEC "cz.RunSpec.v2"
+#define CZ_TYPE_NAME_PATH_SPEC "cz.PathSpec.v2"
+#define CZ_TYPE_NAME_KIND_SPEC "cz.KindSpec.v1"
 
 /** Precedes the records of every frame, whatever its type.
  *
@@ -238,12 +249,13 @@ CZ_ASSERT_(frame_header_flags_offset, offsetof(cz_frame_header_t, flags) == 60);
 /** One vehicle as one zone sees it.
  *
  *  A state frame lists zone after zone in ascending order. Each zone's records are the paper's set
- *  S(t): first the vehicle that left the zone last (`CZ_STATE_LEFT`, absent until one has), in the
- *  zone's own coordinate growing past the conflict point; then the members in order of entry. That
- *  vehicle therefore appears a second time as a member of the next zone. Vehicles on plain links
- *  follow at the end with `zone = CZ_NO_ZONE`. */
+ *  S(t): first those that have left the zone and still count in it (`CZ_STATE_LEFT`; of each exit
+ *  and each path behind it the vehicle that left last, and whoever is not clear of a crossing yet),
+ *  in the zone's own coordinate growing past the end of their path; then the members in order of
+ *  entry. A vehicle that has left therefore appears a second time as a member of the next zone.
+ *  Vehicles on plain links follow at the end with `zone = CZ_NO_ZONE`. */
 typedef struct cz_vehicle_state {
-    /** Distance travelled since the zone's origin on this path, m. */
+    /** Distance travelled since the zone's (or link's) origin on this path, m. */
     double x_m;
     /** Speed, m/s. */
     double v_mps;
@@ -253,7 +265,7 @@ typedef struct cz_vehicle_state {
     double entry_time_s;
     /** Speed at that instant, m/s. */
     double entry_speed_mps;
-    /** Broadcast intent: instant at which the vehicle plans to pass the conflict point, s (0 when
+    /** Broadcast intent: instant at which the vehicle plans to reach the end of its path, s (0 when
      *  it has no plan yet). */
     double planned_exit_time_s;
     /** Broadcast intent: speed at that instant, m/s. */
@@ -264,14 +276,24 @@ typedef struct cz_vehicle_state {
     uint32_t vehicle;
     /** Zone index, or `CZ_NO_ZONE` on a plain link. */
     uint32_t zone;
-    /** Index of the path (approach) within the zone. */
+    /** Index of the path within the zone; on a link, of the one it has come by. */
     uint32_t path;
-    /** Kind of vehicle: 0 CAV, 1 human-driven. */
+    /** Zone it goes to next, or `CZ_NO_ZONE`. */
+    uint32_t next_zone;
+    /** Its path there, or `CZ_NO_PATH`. */
+    uint32_t next_path;
+    /** Its path in the zone after that, or `CZ_NO_PATH`. */
+    uint32_t then_path;
+    /** Index of the link it is on, or `CZ_NO_LINK`. Links are numbered by zone and exit they begin
+     *  at. */
+    uint32_t link;
+    /** Kind of vehicle: index in the scenario's fleet. */
     uint16_t kind;
-    /** Bit 0 entered, bit 1 index 0 (left), bit 2 left in the step just ended. */
+    /** Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3 human
+     *  driver. */
     uint16_t flags;
 } cz_vehicle_state_t;
-CZ_ASSERT_(vehicle_state_size, sizeof(cz_vehicle_state_t) == 80);
+CZ_ASSERT_(vehicle_state_size, sizeof(cz_vehicle_state_t) == 96);
 CZ_ASSERT_ALIGN_(cz_vehicle_state_t, 8);
 CZ_ASSERT_(vehicle_state_x_m_offset, offsetof(cz_vehicle_state_t, x_m) == 0);
 CZ_ASSERT_(vehicle_state_v_mps_offset, offsetof(cz_vehicle_state_t, v_mps) == 8);
@@ -284,19 +306,32 @@ CZ_ASSERT_(vehicle_state_length_m_offset, offsetof(cz_vehicle_state_t, length_m)
 CZ_ASSERT_(vehicle_state_vehicle_offset, offsetof(cz_vehicle_state_t, vehicle) == 64);
 CZ_ASSERT_(vehicle_state_zone_offset, offsetof(cz_vehicle_state_t, zone) == 68);
 CZ_ASSERT_(vehicle_state_path_offset, offsetof(cz_vehicle_state_t, path) == 72);
-CZ_ASSERT_(vehicle_state_kind_offset, offsetof(cz_vehicle_state_t, kind) == 76);
-CZ_ASSERT_(vehicle_state_flags_offset, offsetof(cz_vehicle_state_t, flags) == 78);
+CZ_ASSERT_(vehicle_state_next_zone_offset, offsetof(cz_vehicle_state_t, next_zone) == 76);
+CZ_ASSERT_(vehicle_state_next_path_offset, offsetof(cz_vehicle_state_t, next_path) == 80);
+CZ_ASSERT_(vehicle_state_then_path_offset, offsetof(cz_vehicle_state_t, then_path) == 84);
+CZ_ASSERT_(vehicle_state_link_offset, offsetof(cz_vehicle_state_t, link) == 88);
+CZ_ASSERT_(vehicle_state_kind_offset, offsetof(cz_vehicle_state_t, kind) == 92);
+CZ_ASSERT_(vehicle_state_flags_offset, offsetof(cz_vehicle_state_t, flags) == 94);
 
 /** One constraint of one vehicle, as the zone's coordinator decided it.
  *
  *  A coordinator sends the whole list of each zone that acts in this step; it replaces what the
- *  zone had before. Each member has at least one record; a path with several conflict points has
- *  one per point. */
+ *  zone had before. Each member has at least one record, and one per conflict point at which
+ *  somebody passes before it; members come in the order of the state frame. Between events the
+ *  positions of the two decide what is in force: nothing once the partner is at `until_m`; toward a
+ *  merging partner what is owed to a leader once the vehicle has passed the point; toward a
+ *  crossing one nothing from then on. */
 typedef struct cz_assignment {
-    /** Distance of the conflict point from the zone's origin on the vehicle's path, m. */
+    /** Distance of the conflict point from the zone's origin on the vehicle's path, m. Toward a
+     *  leader, of a place that both pass: what counts is the difference to the next field. */
     double own_conflict_m;
     /** The same point's distance from the origin on the partner's path, m. */
     double partner_conflict_m;
+    /** Distance delta to be kept to the partner beside phi v, m. */
+    double gap_m;
+    /** Position of the partner on its own path from which on nothing is owed to it, m; infinite
+     *  while the two drive on together. */
+    double until_m;
     /** Terminal speed v_m the vehicle is to leave the zone with, m/s. */
     double terminal_speed_mps;
     /** The vehicle bound by this record. */
@@ -305,21 +340,29 @@ typedef struct cz_assignment {
     uint32_t partner;
     /** Zone index. */
     uint32_t zone;
-    /** 0 none, 1 rear end, 2 merge. */
+    /** Index of the conflict point within the zone, or `CZ_NO_POINT`. */
+    uint32_t point;
+    /** Place of the vehicle in the zone's passing order, from 0. */
+    uint32_t rank;
+    /** 0 none, 1 rear end, 2 merge, 3 cross. */
     uint16_t kind;
     /** Bit 0: the terminal speed is free. */
     uint16_t flags;
 } cz_assignment_t;
-CZ_ASSERT_(assignment_size, sizeof(cz_assignment_t) == 40);
+CZ_ASSERT_(assignment_size, sizeof(cz_assignment_t) == 64);
 CZ_ASSERT_ALIGN_(cz_assignment_t, 8);
 CZ_ASSERT_(assignment_own_conflict_m_offset, offsetof(cz_assignment_t, own_conflict_m) == 0);
 CZ_ASSERT_(assignment_partner_conflict_m_offset, offsetof(cz_assignment_t, partner_conflict_m) == 8);
-CZ_ASSERT_(assignment_terminal_speed_mps_offset, offsetof(cz_assignment_t, terminal_speed_mps) == 16);
-CZ_ASSERT_(assignment_vehicle_offset, offsetof(cz_assignment_t, vehicle) == 24);
-CZ_ASSERT_(assignment_partner_offset, offsetof(cz_assignment_t, partner) == 28);
-CZ_ASSERT_(assignment_zone_offset, offsetof(cz_assignment_t, zone) == 32);
-CZ_ASSERT_(assignment_kind_offset, offsetof(cz_assignment_t, kind) == 36);
-CZ_ASSERT_(assignment_flags_offset, offsetof(cz_assignment_t, flags) == 38);
+CZ_ASSERT_(assignment_gap_m_offset, offsetof(cz_assignment_t, gap_m) == 16);
+CZ_ASSERT_(assignment_until_m_offset, offsetof(cz_assignment_t, until_m) == 24);
+CZ_ASSERT_(assignment_terminal_speed_mps_offset, offsetof(cz_assignment_t, terminal_speed_mps) == 32);
+CZ_ASSERT_(assignment_vehicle_offset, offsetof(cz_assignment_t, vehicle) == 40);
+CZ_ASSERT_(assignment_partner_offset, offsetof(cz_assignment_t, partner) == 44);
+CZ_ASSERT_(assignment_zone_offset, offsetof(cz_assignment_t, zone) == 48);
+CZ_ASSERT_(assignment_point_offset, offsetof(cz_assignment_t, point) == 52);
+CZ_ASSERT_(assignment_rank_offset, offsetof(cz_assignment_t, rank) == 56);
+CZ_ASSERT_(assignment_kind_offset, offsetof(cz_assignment_t, kind) == 60);
+CZ_ASSERT_(assignment_flags_offset, offsetof(cz_assignment_t, flags) == 62);
 
 /** A zone's traffic, told to one neighbour at the zone's own events.
  *
@@ -349,60 +392,63 @@ CZ_ASSERT_(zone_summary_segment_vehicles_offset, offsetof(cz_zone_summary_t, seg
 
 /** One vehicle's command for the step, and what its controller must remember.
  *
- *  Commands come in the order of the state frame. The `plan_*` fields and `mode` are the
- *  controller's memory: with them a frame holds all that a controller needs to go on from it. A
- *  controller of another kind may use them freely. */
+ *  Commands come in the order of the state frame. `mode` and the memory words are the controller's
+ *  own: they mean what its law says, and with them a frame holds all that a controller needs to go
+ *  on from it. */
 typedef struct cz_vehicle_command {
     /** Acceleration over `[k * dt, (k + 1) * dt)`, m/s^2. */
     double u_mps2;
-    /** Broadcast intent: planned instant at the conflict point, s (0 when there is no plan). */
+    /** Broadcast intent: planned instant at the end of the path, s (0 when there is no plan). */
     double planned_exit_time_s;
     /** Broadcast intent: planned speed there, m/s. */
     double planned_exit_speed_mps;
-    /** Memory: instant at which the plan starts, s. */
-    double plan_start_s;
-    /** Memory: position at that instant, m. */
-    double plan_origin_m;
-    /** Memory: speed at that instant, m/s (coefficient c). */
-    double plan_v0_mps;
-    /** Memory: coefficient a of u*(t) = a t + b, m/s^3. */
-    double plan_a;
-    /** Memory: coefficient b, m/s^2. */
-    double plan_b;
-    /** Memory: duration T of the plan, s (0 when there is no plan). */
-    double plan_duration_s;
-    /** Memory: terminal speed the plan was made for, m/s (-1 when it was free). */
-    double plan_terminal_mps;
+    /** Memory. */
+    double memory_0;
+    /** Memory. */
+    double memory_1;
+    /** Memory. */
+    double memory_2;
+    /** Memory. */
+    double memory_3;
+    /** Memory. */
+    double memory_4;
+    /** Memory. */
+    double memory_5;
+    /** Memory. */
+    double memory_6;
+    /** Memory. */
+    double memory_7;
     /** The vehicle. */
     uint32_t vehicle;
     /** Its zone. */
     uint32_t zone;
     /** Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4 rear end, 5
-     *  rear-end feasibility, 6 merge, 7 merge feasibility. */
+     *  rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross feasibility. */
     uint32_t binding_rows;
-    /** Memory: 0 entered, 1 FE, 2 OCBF. */
+    /** Memory: 0 entered, 1 FE, 2 OCBF; other laws may have other modes. */
     uint16_t mode;
     /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a deadline was
      *  missed, and refused from a controller: 4 held, 5 held within what the shield allows. */
     uint16_t verdict;
 } cz_vehicle_command_t;
-CZ_ASSERT_(vehicle_command_size, sizeof(cz_vehicle_command_t) == 96);
+CZ_ASSERT_(vehicle_command_size, sizeof(cz_vehicle_command_t) == 104);
 CZ_ASSERT_ALIGN_(cz_vehicle_command_t, 8);
 CZ_ASSERT_(vehicle_command_u_mps2_offset, offsetof(cz_vehicle_command_t, u_mps2) == 0);
 CZ_ASSERT_(vehicle_command_planned_exit_time_s_offset, offsetof(cz_vehicle_command_t, planned_exit_time_s) == 8);
 CZ_ASSERT_(vehicle_command_planned_exit_speed_mps_offset, offsetof(cz_vehicle_command_t, planned_exit_speed_mps) == 16);
-CZ_ASSERT_(vehicle_command_plan_start_s_offset, offsetof(cz_vehicle_command_t, plan_start_s) == 24);
-CZ_ASSERT_(vehicle_command_plan_origin_m_offset, offsetof(cz_vehicle_command_t, plan_origin_m) == 32);
-CZ_ASSERT_(vehicle_command_plan_v0_mps_offset, offsetof(cz_vehicle_command_t, plan_v0_mps) == 40);
-CZ_ASSERT_(vehicle_command_plan_a_offset, offsetof(cz_vehicle_command_t, plan_a) == 48);
-CZ_ASSERT_(vehicle_command_plan_b_offset, offsetof(cz_vehicle_command_t, plan_b) == 56);
-CZ_ASSERT_(vehicle_command_plan_duration_s_offset, offsetof(cz_vehicle_command_t, plan_duration_s) == 64);
-CZ_ASSERT_(vehicle_command_plan_terminal_mps_offset, offsetof(cz_vehicle_command_t, plan_terminal_mps) == 72);
-CZ_ASSERT_(vehicle_command_vehicle_offset, offsetof(cz_vehicle_command_t, vehicle) == 80);
-CZ_ASSERT_(vehicle_command_zone_offset, offsetof(cz_vehicle_command_t, zone) == 84);
-CZ_ASSERT_(vehicle_command_binding_rows_offset, offsetof(cz_vehicle_command_t, binding_rows) == 88);
-CZ_ASSERT_(vehicle_command_mode_offset, offsetof(cz_vehicle_command_t, mode) == 92);
-CZ_ASSERT_(vehicle_command_verdict_offset, offsetof(cz_vehicle_command_t, verdict) == 94);
+CZ_ASSERT_(vehicle_command_memory_0_offset, offsetof(cz_vehicle_command_t, memory_0) == 24);
+CZ_ASSERT_(vehicle_command_memory_1_offset, offsetof(cz_vehicle_command_t, memory_1) == 32);
+CZ_ASSERT_(vehicle_command_memory_2_offset, offsetof(cz_vehicle_command_t, memory_2) == 40);
+CZ_ASSERT_(vehicle_command_memory_3_offset, offsetof(cz_vehicle_command_t, memory_3) == 48);
+CZ_ASSERT_(vehicle_command_memory_4_offset, offsetof(cz_vehicle_command_t, memory_4) == 56);
+CZ_ASSERT_(vehicle_command_memory_5_offset, offsetof(cz_vehicle_command_t, memory_5) == 64);
+CZ_ASSERT_(vehicle_command_memory_6_offset, offsetof(cz_vehicle_command_t, memory_6) == 72);
+CZ_ASSERT_(vehicle_command_memory_7_offset, offsetof(cz_vehicle_command_t, memory_7) == 80);
+CZ_ASSERT_(vehicle_command_vehicle_offset, offsetof(cz_vehicle_command_t, vehicle) == 88);
+CZ_ASSERT_(vehicle_command_zone_offset, offsetof(cz_vehicle_command_t, zone) == 92);
+CZ_ASSERT_(vehicle_command_binding_rows_offset, offsetof(cz_vehicle_command_t, binding_rows) == 96);
+CZ_ASSERT_(vehicle_command_mode_offset, offsetof(cz_vehicle_command_t, mode) == 100);
+CZ_ASSERT_(vehicle_command_verdict_offset, offsetof(cz_vehicle_command_t, verdict) == 102);
 
 /** World -> coordinators and controllers: the process that has a place in the run.
  *
@@ -515,8 +561,8 @@ CZ_ASSERT_(attach_reply_reserved_offset, offsetof(cz_attach_reply_t, reserved) =
 
 /** The numbers of a run: step, limits, distances, and the built-in law's gains.
  *
- *  The reply to a plug-in that joins carries one, then `approaches` records of
- *  `cz_approach_spec_t`, then for each of these a line of UTF-8 text, `ZONE.APPROACH`. */
+ *  The reply to a plug-in that joins carries one, then `paths` records of `cz_path_spec_t`, then
+ *  `kinds` records of `cz_kind_spec_t`, then for each path a line of UTF-8 text, `ZONE.PATH`. */
 typedef struct cz_run_spec {
     /** Step length, s. */
     double dt_s;
@@ -548,7 +594,7 @@ typedef struct cz_run_spec {
     double clf_rate_per_s;
     /** Weight lambda of the squared slack. */
     double slack_weight;
-    /** Fraction of the approach within which FE mode may act. */
+    /** Fraction of the path within which FE mode may act. */
     double fe_fraction;
     /** Step length, ns. Simulated time is `step * dt_ns`. */
     uint64_t dt_ns;
@@ -556,14 +602,18 @@ typedef struct cz_run_spec {
     uint64_t seed;
     /** Number of zones. */
     uint32_t zones;
-    /** Number of approaches, of all zones. */
-    uint32_t approaches;
+    /** Number of paths, of all zones. */
+    uint32_t paths;
+    /** Number of kinds of vehicles. */
+    uint32_t kinds;
+    /** 0; room for what comes later. */
+    uint32_t reserved;
     /** Switches of the built-in law, one bit each. */
     uint32_t law_flags;
     /** 0 off, 1 observe, 2 on. */
     uint32_t shield;
 } cz_run_spec_t;
-CZ_ASSERT_(run_spec_size, sizeof(cz_run_spec_t) == 160);
+CZ_ASSERT_(run_spec_size, sizeof(cz_run_spec_t) == 168);
 CZ_ASSERT_ALIGN_(cz_run_spec_t, 8);
 CZ_ASSERT_(run_spec_dt_s_offset, offsetof(cz_run_spec_t, dt_s) == 0);
 CZ_ASSERT_(run_spec_max_time_s_offset, offsetof(cz_run_spec_t, max_time_s) == 8);
@@ -584,39 +634,69 @@ CZ_ASSERT_(run_spec_fe_fraction_offset, offsetof(cz_run_spec_t, fe_fraction) == 
 CZ_ASSERT_(run_spec_dt_ns_offset, offsetof(cz_run_spec_t, dt_ns) == 128);
 CZ_ASSERT_(run_spec_seed_offset, offsetof(cz_run_spec_t, seed) == 136);
 CZ_ASSERT_(run_spec_zones_offset, offsetof(cz_run_spec_t, zones) == 144);
-CZ_ASSERT_(run_spec_approaches_offset, offsetof(cz_run_spec_t, approaches) == 148);
-CZ_ASSERT_(run_spec_law_flags_offset, offsetof(cz_run_spec_t, law_flags) == 152);
-CZ_ASSERT_(run_spec_shield_offset, offsetof(cz_run_spec_t, shield) == 156);
+CZ_ASSERT_(run_spec_paths_offset, offsetof(cz_run_spec_t, paths) == 148);
+CZ_ASSERT_(run_spec_kinds_offset, offsetof(cz_run_spec_t, kinds) == 152);
+CZ_ASSERT_(run_spec_reserved_offset, offsetof(cz_run_spec_t, reserved) == 156);
+CZ_ASSERT_(run_spec_law_flags_offset, offsetof(cz_run_spec_t, law_flags) == 160);
+CZ_ASSERT_(run_spec_shield_offset, offsetof(cz_run_spec_t, shield) == 164);
 
-/** One approach of one zone; zones ascending, then paths. */
-typedef struct cz_approach_spec {
-    /** Distance from the zone's origin to the conflict point, m. */
+/** One path of one zone; zones ascending, then paths. */
+typedef struct cz_path_spec {
+    /** Length from the zone's origin to its exit, m. */
     double length_m;
-    /** Length of the link behind the zone's exit, m (0: none). */
+    /** Length of the link behind the exit, m (0: none). */
     double link_m;
     /** Zone index. */
     uint32_t zone;
     /** Index of the path within the zone. */
     uint32_t path;
-    /** Zone the exit leads to, or `CZ_NO_ZONE`. */
+    /** Index of the exit it leads to within the zone. */
+    uint32_t exit;
+    /** Zone the exit leads to, or `CZ_NO_ZONE`. Which path a vehicle takes there is in its
+     *  `cz_vehicle_state_t`. */
     uint32_t next_zone;
-    /** Path within that zone. */
-    uint32_t next_path;
-    /** Index of the controller process that drives the approach. */
+    /** Index of the controller process that drives the path. */
     uint32_t controller;
     /** Bit 0: the controller that asked drives it. */
     uint32_t flags;
-} cz_approach_spec_t;
-CZ_ASSERT_(approach_spec_size, sizeof(cz_approach_spec_t) == 40);
-CZ_ASSERT_ALIGN_(cz_approach_spec_t, 8);
-CZ_ASSERT_(approach_spec_length_m_offset, offsetof(cz_approach_spec_t, length_m) == 0);
-CZ_ASSERT_(approach_spec_link_m_offset, offsetof(cz_approach_spec_t, link_m) == 8);
-CZ_ASSERT_(approach_spec_zone_offset, offsetof(cz_approach_spec_t, zone) == 16);
-CZ_ASSERT_(approach_spec_path_offset, offsetof(cz_approach_spec_t, path) == 20);
-CZ_ASSERT_(approach_spec_next_zone_offset, offsetof(cz_approach_spec_t, next_zone) == 24);
-CZ_ASSERT_(approach_spec_next_path_offset, offsetof(cz_approach_spec_t, next_path) == 28);
-CZ_ASSERT_(approach_spec_controller_offset, offsetof(cz_approach_spec_t, controller) == 32);
-CZ_ASSERT_(approach_spec_flags_offset, offsetof(cz_approach_spec_t, flags) == 36);
+} cz_path_spec_t;
+CZ_ASSERT_(path_spec_size, sizeof(cz_path_spec_t) == 40);
+CZ_ASSERT_ALIGN_(cz_path_spec_t, 8);
+CZ_ASSERT_(path_spec_length_m_offset, offsetof(cz_path_spec_t, length_m) == 0);
+CZ_ASSERT_(path_spec_link_m_offset, offsetof(cz_path_spec_t, link_m) == 8);
+CZ_ASSERT_(path_spec_zone_offset, offsetof(cz_path_spec_t, zone) == 16);
+CZ_ASSERT_(path_spec_path_offset, offsetof(cz_path_spec_t, path) == 20);
+CZ_ASSERT_(path_spec_exit_offset, offsetof(cz_path_spec_t, exit) == 24);
+CZ_ASSERT_(path_spec_next_zone_offset, offsetof(cz_path_spec_t, next_zone) == 28);
+CZ_ASSERT_(path_spec_controller_offset, offsetof(cz_path_spec_t, controller) == 32);
+CZ_ASSERT_(path_spec_flags_offset, offsetof(cz_path_spec_t, flags) == 36);
+
+/** One kind of vehicle, in the order of `cz_vehicle_state_t.kind`. */
+typedef struct cz_kind_spec {
+    /** Strongest braking, m/s^2, negative. */
+    double u_min_mps2;
+    /** Strongest acceleration, m/s^2. */
+    double u_max_mps2;
+    /** Least speed, m/s. */
+    double v_min_mps;
+    /** Greatest speed, m/s. */
+    double v_max_mps;
+    /** Length, m. */
+    double length_m;
+    /** Reaction time phi, s. */
+    double reaction_time_s;
+    /** Standstill gap delta, m. */
+    double standstill_gap_m;
+} cz_kind_spec_t;
+CZ_ASSERT_(kind_spec_size, sizeof(cz_kind_spec_t) == 56);
+CZ_ASSERT_ALIGN_(cz_kind_spec_t, 8);
+CZ_ASSERT_(kind_spec_u_min_mps2_offset, offsetof(cz_kind_spec_t, u_min_mps2) == 0);
+CZ_ASSERT_(kind_spec_u_max_mps2_offset, offsetof(cz_kind_spec_t, u_max_mps2) == 8);
+CZ_ASSERT_(kind_spec_v_min_mps_offset, offsetof(cz_kind_spec_t, v_min_mps) == 16);
+CZ_ASSERT_(kind_spec_v_max_mps_offset, offsetof(cz_kind_spec_t, v_max_mps) == 24);
+CZ_ASSERT_(kind_spec_length_m_offset, offsetof(cz_kind_spec_t, length_m) == 32);
+CZ_ASSERT_(kind_spec_reaction_time_s_offset, offsetof(cz_kind_spec_t, reaction_time_s) == 40);
+CZ_ASSERT_(kind_spec_standstill_gap_m_offset, offsetof(cz_kind_spec_t, standstill_gap_m) == 48);
 
 #undef CZ_ASSERT_
 #undef CZ_ASSERT_ALIGN_

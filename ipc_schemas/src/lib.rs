@@ -36,7 +36,7 @@ pub use summary::*;
 compile_error!("frames are little-endian and are used in place");
 
 /// The layouts of all record types, in the order the schema hash covers them.
-pub const LAYOUTS: [Layout; 10] = [
+pub const LAYOUTS: [Layout; 11] = [
     FrameHeader::LAYOUT,
     VehicleState::LAYOUT,
     Assignment::LAYOUT,

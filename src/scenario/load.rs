@@ -191,7 +191,14 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let road_names = topology::unique_names(&road_tables, "road")?;
     let zone_names = topology::unique_names(&zone_tables, "zone")?;
     let step_m = vehicle.v_max_mps * dt_s;
-    let mut topology = topology::read(&zone_tables, &zone_names, &road_tables, &road_names, (step_m, vehicle.v_max_mps), law)?;
+    let mut topology = topology::read(
+        &zone_tables,
+        &zone_names,
+        &road_tables,
+        &road_names,
+        (step_m, vehicle.v_max_mps),
+        law,
+    )?;
 
     flow_policies(&zone_tables, &mut topology, &vehicle)?;
 

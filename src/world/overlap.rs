@@ -8,8 +8,8 @@
 
 use super::car::Car;
 use super::role::World;
-use crate::lanes::Lanes;
 use crate::conflict::{Conflicts, PointKind, Run};
+use crate::lanes::Lanes;
 use crate::scenario::{Scenario, VehicleParams};
 use crate::vehicle::Held;
 use serde::{Deserialize, Serialize};
@@ -105,8 +105,7 @@ impl Overlaps {
         let b_leads = b.motion.position_m(from_s) + shift_m >= a.motion.position_m(from_s);
         let whole_m = if b_leads { b.length_m } else { a.length_m };
         let body_m = whole_m - TOLERANCE_M;
-        let (a_to_m, b_to_m) =
-            (a.motion.position_m(look.dt_s), b.motion.position_m(look.dt_s) + shift_m);
+        let (a_to_m, b_to_m) = (a.motion.position_m(look.dt_s), b.motion.position_m(look.dt_s) + shift_m);
         if b.motion.x0_m + shift_m - body_m >= a_to_m || a.motion.x0_m - body_m >= b_to_m {
             return;
         }
@@ -223,7 +222,8 @@ impl World {
             }
             let count = self.cars[down].len();
             for at in 0..count + self.overlaps.tails[down].len() {
-                let other = if at < count { self.cars[down][at] } else { self.overlaps.tails[down][at - count] };
+                let other =
+                    if at < count { self.cars[down][at] } else { self.overlaps.tails[down][at - count] };
                 if paths[other.path as usize].segments[0] == to.segment {
                     let held = other.held();
                     self.overlaps.compare(look, own, look.body(&other, &held), to.link_m, 0.0);

@@ -2,7 +2,7 @@
 
 use super::{LENGTH, OCBF, ahead, at, cases, permitted, with};
 use control_zones::control::rows::Row;
-use control_zones::control::{Law, Situation, Terminal, Verdict};
+use control_zones::control::{Law, Ocbf, Situation, Terminal, Verdict};
 use control_zones::scenario::Scenario;
 use control_zones::vehicle::{Held, RearEnd};
 use proptest::prelude::*;
@@ -29,7 +29,7 @@ struct Chase {
 
 /// Follows a leader that holds each of `leader_us` for half a second, over and over.
 fn chase(scenario: &Scenario, v: f64, gap: f64, leader_v: f64, leader_us: &[f64]) -> Chase {
-    let (dt, law, rear) = (scenario.dt_s(), Law::new(scenario), rear_end(scenario));
+    let (dt, law, rear) = (scenario.dt_s(), Ocbf::new(scenario), rear_end(scenario));
     let hold = (0.5 / dt).round() as usize;
     let (mut x, mut v) = (0.0, v);
     let entry = v;

@@ -2,15 +2,16 @@
 
 mod closed_loop;
 
-use control_zones::control::law::mean_optimal_terminal_speed_mps;
+use control_zones::conflict::DutyKind;
+use control_zones::control::ocbf::mean_optimal_terminal_speed_mps;
 use control_zones::control::reference::{Problem, optimal_terminal_speed_mps};
 use control_zones::control::rows::{Interval, Row, Rows};
 use control_zones::control::{
-    Decision, Law, Memory, Mode, Partner, PartnerKind, Reference, Situation, Terminal, Verdict,
+    Decision, Law, Memory, Mode, Ocbf, Partner, Reference, Situation, Terminal, Verdict,
 };
 use control_zones::scenario::{
     ControlParams, FeConditions, Network, PositionFeedback, ReferenceLaw, Replan, SafetyRows, Scenario,
-    Solver, VehicleParams,
+    Solver, VehicleKind, VehicleParams,
 };
 use control_zones::vehicle::Inequality;
 use proptest::prelude::*;
@@ -21,6 +22,16 @@ fn cases(cases: u32) -> ProptestConfig {
     ProptestConfig { cases, failure_persistence: None, ..ProptestConfig::default() }
 }
 
+const VEHICLE: VehicleParams = VehicleParams {
+    u_min_mps2: -4.0,
+    u_max_mps2: 4.0,
+    v_min_mps: 0.0,
+    v_max_mps: 30.0,
+    length_m: 5.0,
+    reaction_time_s: 1.8,
+    standstill_gap_m: 0.0,
+};
+
 /// The paper's numbers. The law reads nothing of the network.
 fn scenario() -> Scenario {
     Scenario {
@@ -30,15 +41,8 @@ fn scenario() -> Scenario {
         max_vehicles: None,
         max_time_s: 60.0,
         network: Network { zones: Vec::new(), roads: Vec::new() },
-        vehicle: VehicleParams {
-            u_min_mps2: -4.0,
-            u_max_mps2: 4.0,
-            v_min_mps: 0.0,
-            v_max_mps: 30.0,
-            length_m: 5.0,
-            reaction_time_s: 1.8,
-            standstill_gap_m: 0.0,
-        },
+        vehicle: VEHICLE,
+        fleet: vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: VEHICLE }],
         control: ControlParams {
             reference: ReferenceLaw::Corrected,
             replan: Replan::FromEntry,
@@ -78,21 +82,22 @@ fn at(time_s: f64, x_m: f64, v_mps: f64) -> Situation {
         entry_speed_mps: v_mps,
         length_m: LENGTH,
         terminal: Terminal::Speed(18.5),
+        kind: 0,
     }
 }
 
 fn ahead(x_m: f64, v_mps: f64, u_mps2: f64) -> Partner {
-    Partner { kind: PartnerKind::RearEnd, x_m, v_mps, u_mps2, conflict_m: LENGTH }
+    Partner { kind: DutyKind::RearEnd, x_m, v_mps, u_mps2, conflict_m: LENGTH, gap_m: 0.0 }
 }
 
 fn merging(x_m: f64, v_mps: f64, u_mps2: f64) -> Partner {
-    Partner { kind: PartnerKind::Merge, ..ahead(x_m, v_mps, u_mps2) }
+    Partner { kind: DutyKind::Merge, ..ahead(x_m, v_mps, u_mps2) }
 }
 
 const OCBF: Memory = Memory { mode: Mode::Ocbf, plan: None };
 
 fn decide(scenario: &Scenario, s: &Situation, partners: &[Partner], memory: &mut Memory) -> Decision {
-    Law::new(scenario).decide(s, partners.iter().copied(), memory)
+    Ocbf::new(scenario).decide(s, partners.iter().copied(), memory)
 }
 
 /// The decision of a vehicle that has left FE mode but has no plan yet.
@@ -111,7 +116,7 @@ fn permitted(scenario: &Scenario, s: &Situation, partners: &[Partner]) -> Interv
     for p in partners {
         let dv = p.v_mps - s.v_mps;
         match p.kind {
-            PartnerKind::RearEnd => {
+            DutyKind::RearEnd => {
                 let b1 = p.x_m - s.x_m - phi * s.v_mps - delta;
                 match c.safety_rows {
                     SafetyRows::Continuous => at_most(phi, dv + c.k_rear_end_per_s * b1, Row::RearEnd),
@@ -126,7 +131,7 @@ fn permitted(scenario: &Scenario, s: &Situation, partners: &[Partner]) -> Interv
                     at_most(1.0, bound, Row::RearEndFeasibility);
                 }
             }
-            PartnerKind::Merge => {
+            DutyKind::Merge | DutyKind::Cross => {
                 let phi2 = phi / p.conflict_m;
                 let b2 = p.x_m - s.x_m - phi2 * s.x_m * s.v_mps - delta;
                 let drift = dv - phi2 * s.v_mps * s.v_mps;

@@ -112,9 +112,9 @@ fn replay_names_the_role_that_did_otherwise() {
     let (names, _) = differing(&run.with(|steps| steps[at].commands[1].records[0].u_mps2 -= 1.0));
     assert_eq!(names, ["world", "controller 1"]);
     // What nobody but the controller looks at.
-    let (names, result) = differing(&run.with(|steps| steps[at].commands[0].records[0].plan_a += 1.0));
+    let (names, result) = differing(&run.with(|steps| steps[at].commands[0].records[0].memory_3 += 1.0));
     assert_eq!(names, ["controller 0"]);
-    assert!(result.roles[3].difference.as_ref().unwrap().contains("plan_a"), "{result:?}");
+    assert!(result.roles[3].difference.as_ref().unwrap().contains("memory_3"), "{result:?}");
     // A terminal speed the coordinator did not set.
     let zone = run.steps[at].coordination[0].zone;
     let (names, _) = differing(&run.with(|steps| steps[at].coordination[0].flags ^= 1));

@@ -6,9 +6,10 @@
 //! pointer a function returns points into the handle and lives until the next call that the header names.
 
 use control_zones_plugin::schemas::{
-    ApproachSpec, Assignment, FrameHeader, RunSpec, VehicleCommand, VehicleState,
+    Assignment, CONSTRAINT_CROSS, CONSTRAINT_MERGE, CONSTRAINT_REAR_END, FrameHeader, PathSpec, RunSpec,
+    VehicleCommand, VehicleState,
 };
-use control_zones_plugin::{Commands, Error, Options, Session, Wake};
+use control_zones_plugin::{Commands, Error, Options, PartnerKind, Session, Wake};
 use std::cell::RefCell;
 use std::ffi::{CStr, CString, c_char, c_double, c_int};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -33,10 +34,31 @@ pub struct Plugin {
     // Before the session it was lent from.
     commands: Option<Commands>,
     session: Session,
-    approaches: Vec<ApproachSpec>,
+    paths: Vec<PathSpec>,
     names: Vec<CString>,
     vehicles: Vec<Vehicle>,
+    /// Partners of all vehicles, and where each one's end.
+    partners: Vec<Partner>,
+    ends: Vec<usize>,
 }
+
+/// A vehicle that another must respect.
+#[repr(C)]
+#[derive(Clone, Copy, Debug)]
+pub struct Partner {
+    /// Its record in the state frame.
+    pub state: *const VehicleState,
+    /// Its position in the vehicle's own coordinate, m.
+    pub x_m: f64,
+    /// Distance of the conflict point on the vehicle's path, m; means nothing toward a leader.
+    pub at_m: f64,
+    /// Distance to be kept to it beside phi v, m.
+    pub gap_m: f64,
+    /// `CZ_CONSTRAINT_REAR_END`, `CZ_CONSTRAINT_MERGE` or `CZ_CONSTRAINT_CROSS`: what is owed to it now.
+    pub kind: u64,
+}
+
+const _: () = assert!(size_of::<Partner>() == 32 + size_of::<usize>());
 
 /// One vehicle to be commanded, with its partners looked up.
 #[repr(C)]
@@ -44,11 +66,11 @@ pub struct Plugin {
 pub struct Vehicle {
     /// Its record in the state frame.
     pub state: *const VehicleState,
-    /// The vehicle ahead on the same path, or null.
+    /// The nearest vehicle ahead on its way, or null.
     pub ahead: *const VehicleState,
-    /// The vehicle of another path that passes the conflict point first, or null.
+    /// The vehicle that passes the nearest conflict point first, or null. `cz_partners` has all.
     pub merge: *const VehicleState,
-    /// Length of its approach, m.
+    /// Length of its path, m.
     pub length_m: f64,
     /// Terminal speed, m/s; NaN when it is free.
     pub terminal_mps: f64,
@@ -113,10 +135,18 @@ pub unsafe extern "C" fn cz_attach(
             schema_hash: control_zones_plugin::schemas::schema_hash(),
         };
         let session = Session::attach(&options)?;
-        let approaches = session.run().approaches.iter().map(|a| a.spec).collect();
-        let names = session.run().approaches.iter();
+        let paths = session.run().paths.iter().map(|a| a.spec).collect();
+        let names = session.run().paths.iter();
         let names = names.map(|a| CString::new(a.name.as_str()).unwrap_or_default()).collect();
-        let plugin = Plugin { commands: None, session, approaches, names, vehicles: Vec::new() };
+        let plugin = Plugin {
+            commands: None,
+            session,
+            paths,
+            names,
+            vehicles: Vec::new(),
+            partners: Vec::new(),
+            ends: Vec::new(),
+        };
         Ok(Box::into_raw(Box::new(plugin)))
     })
 }
@@ -164,6 +194,8 @@ pub unsafe extern "C" fn cz_wait(plugin: *mut Plugin, timeout_s: c_double) -> c_
 impl Plugin {
     fn look_up(&mut self) {
         self.vehicles.clear();
+        self.partners.clear();
+        self.ends.clear();
         for vehicle in self.session.step().vehicles() {
             let mut found = Vehicle {
                 state: vehicle.state,
@@ -175,17 +207,24 @@ impl Plugin {
                 merge_x_m: f64::NAN,
                 merge_at_m: f64::NAN,
             };
-            for partner in vehicle.partners() {
-                if partner.merges {
-                    found.merge = partner.state;
-                    found.merge_x_m = partner.x_m;
-                    found.merge_at_m = partner.conflict_m;
-                } else {
-                    found.ahead = partner.state;
-                    found.ahead_x_m = partner.x_m;
+            for control_zones_plugin::Partner { state, kind, x_m, conflict_m, gap_m } in vehicle.partners() {
+                let code = match kind {
+                    PartnerKind::RearEnd => CONSTRAINT_REAR_END,
+                    PartnerKind::Merge => CONSTRAINT_MERGE,
+                    PartnerKind::Cross => CONSTRAINT_CROSS,
+                };
+                self.partners.push(Partner { state, x_m, at_m: conflict_m, gap_m, kind: code.into() });
+                // The nearest of several.
+                if kind == PartnerKind::RearEnd {
+                    if found.ahead.is_null() || x_m < found.ahead_x_m {
+                        (found.ahead, found.ahead_x_m) = (state, x_m);
+                    }
+                } else if found.merge.is_null() || conflict_m < found.merge_at_m {
+                    (found.merge, found.merge_x_m, found.merge_at_m) = (state, x_m, conflict_m);
                 }
             }
             self.vehicles.push(found);
+            self.ends.push(self.partners.len());
         }
     }
 }
@@ -200,26 +239,26 @@ pub unsafe extern "C" fn cz_run_spec(plugin: *const Plugin) -> *const RunSpec {
     unsafe { &(*plugin).session.run().spec }
 }
 
-/// All approaches; valid until detached.
+/// All paths; valid until detached.
 ///
 /// # Safety
 /// `plugin` is from `cz_attach`; `count` may be written.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn cz_approaches(plugin: *const Plugin, count: *mut usize) -> *const ApproachSpec {
+pub unsafe extern "C" fn cz_paths(plugin: *const Plugin, count: *mut usize) -> *const PathSpec {
     // SAFETY: a live handle, and a place to write to.
     unsafe {
-        let approaches = &(*plugin).approaches;
-        *count = approaches.len();
-        approaches.as_ptr()
+        let paths = &(*plugin).paths;
+        *count = paths.len();
+        paths.as_ptr()
     }
 }
 
-/// The name of an approach, `ZONE.APPROACH`; null beyond the last one.
+/// The name of a path, `ZONE.PATH`; null beyond the last one.
 ///
 /// # Safety
 /// `plugin` is from `cz_attach`.
 #[unsafe(no_mangle)]
-pub unsafe extern "C" fn cz_approach_name(plugin: *const Plugin, index: usize) -> *const c_char {
+pub unsafe extern "C" fn cz_path_name(plugin: *const Plugin, index: usize) -> *const c_char {
     // SAFETY: a live handle.
     let names = unsafe { &(*plugin).names };
     names.get(index).map_or(null(), |name| name.as_ptr())
@@ -263,6 +302,27 @@ pub unsafe extern "C" fn cz_vehicles(plugin: *const Plugin, count: *mut usize) -
         let vehicles = &(*plugin).vehicles;
         *count = vehicles.len();
         vehicles.as_ptr()
+    }
+}
+
+/// All vehicles that one to be commanded (its place among `cz_vehicles`) must respect where they are now; valid until
+/// `cz_send`.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`; `count` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_partners(
+    plugin: *const Plugin,
+    vehicle: usize,
+    count: *mut usize,
+) -> *const Partner {
+    // SAFETY: a live handle, and a place to write to.
+    unsafe {
+        let Plugin { partners, ends, .. } = &*plugin;
+        let to = ends.get(vehicle).copied().unwrap_or(0);
+        let from = vehicle.checked_sub(1).and_then(|before| ends.get(before).copied()).unwrap_or(0).min(to);
+        *count = to - from;
+        partners[from..to].as_ptr()
     }
 }
 
@@ -320,6 +380,8 @@ pub unsafe extern "C" fn cz_send(plugin: *mut Plugin) -> c_int {
             None => plugin.session.take_commands()?,
         };
         plugin.vehicles.clear();
+        plugin.partners.clear();
+        plugin.ends.clear();
         plugin.session.send(commands)?;
         Ok(0)
     })

@@ -17,6 +17,6 @@ may be kept, where numpy is installed, and lists where it is not.
 
 from . import _schemas as schemas
 from ._session import Error, Run, Session, run
-from ._view import ZoneView
+from ._view import Partner, ZoneView
 
-__all__ = ["Error", "Run", "Session", "ZoneView", "run", "schemas"]
+__all__ = ["Error", "Partner", "Run", "Session", "ZoneView", "run", "schemas"]

@@ -11,7 +11,7 @@ import ctypes
 import sys
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0x3e9f1a13b126324d
+SCHEMA_HASH = 0x7e50f4f5fb4edbd2
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -27,25 +27,34 @@ FLAG_MISSED = 2
 
 #: No vehicle: the value of a vehicle field that names nobody.
 NO_VEHICLE = 4294967295
-#: No zone: a vehicle between zones, on a plain link.
+#: No zone: a vehicle between zones, on a plain link, or a way that leads out of the network.
 NO_ZONE = 4294967295
-#: `VehicleState.kind`: a connected automated vehicle, driven by a controller.
-KIND_CAV = 0
-#: `VehicleState.kind`: a human-driven vehicle (reserved; no v1 world sends one).
-KIND_HUMAN = 1
+#: No path: a way that leads out of the network.
+NO_PATH = 4294967295
+#: No link: a vehicle in a zone.
+NO_LINK = 4294967295
 #: `VehicleState.flags`: entered the zone during the step just ended (an event of the zone).
 STATE_ENTERED = 1
-#: `VehicleState.flags`: index 0 of the zone, the vehicle that left it last. Not to be commanded.
+#: `VehicleState.flags`: has left the zone and still counts in it (index 0 of the paper). Not to be
+#: commanded.
 STATE_LEFT = 2
-#: `VehicleState.flags`: left the zone during the step just ended (an event of the zone).
+#: `VehicleState.flags`: somebody left the zone during the step just ended (an event of the zone);
+#: set in all its records that have `STATE_LEFT`.
 STATE_LEFT_NOW = 4
+#: `VehicleState.flags`: driven by a human. Not to be commanded. Reserved: no world sends it yet.
+STATE_HUMAN = 8
 
 #: `Assignment.kind`: no partner; the record only carries the terminal speed.
 CONSTRAINT_NONE = 0
-#: `Assignment.kind`: the partner drives ahead on the same path (paper: i_p).
+#: `Assignment.kind`: the partner drives ahead on the way the two share (paper: i_p).
 CONSTRAINT_REAR_END = 1
-#: `Assignment.kind`: the partner passes the shared conflict point first (paper: i-1).
+#: `Assignment.kind`: the partner passes the merge first (paper: i-1). Behind it, it is the leader.
 CONSTRAINT_MERGE = 2
+#: `Assignment.kind`: the partner crosses first. Nothing is owed once the vehicle has reached the
+#: crossing.
+CONSTRAINT_CROSS = 3
+#: `Assignment.point`: none; toward a leader.
+NO_POINT = 4294967295
 #: `Assignment.flags`: the terminal speed is free; `terminal_speed_mps` is 0 and means nothing.
 ASSIGNMENT_FREE_TERMINAL = 1
 
@@ -106,8 +115,8 @@ ATTACH_UNDER_WAY = 6
 #: `AttachReply.status`: the request names a phase there is not.
 ATTACH_BAD_PHASE = 7
 
-#: `ApproachSpec.flags`: the controller that asked drives this approach.
-APPROACH_OWN = 1
+#: `PathSpec.flags`: the controller that asked drives this path.
+PATH_OWN = 1
 #: `RunSpec.law_flags`: the reference trajectory follows the condition as the paper prints it.
 LAW_AS_PRINTED = 1
 #: `RunSpec.law_flags`: a new terminal speed makes a new plan from the present state.
@@ -201,27 +210,34 @@ class VehicleState(ctypes.Structure):
     """One vehicle as one zone sees it.
 
     A state frame lists zone after zone in ascending order. Each zone's records are the paper's set
-    S(t): first the vehicle that left the zone last (`STATE_LEFT`, absent until one has), in the
-    zone's own coordinate growing past the conflict point; then the members in order of entry. That
-    vehicle therefore appears a second time as a member of the next zone. Vehicles on plain links
-    follow at the end with `zone = NO_ZONE`.
+    S(t): first those that have left the zone and still count in it (`STATE_LEFT`; of each exit and
+    each path behind it the vehicle that left last, and whoever is not clear of a crossing yet), in
+    the zone's own coordinate growing past the end of their path; then the members in order of
+    entry. A vehicle that has left therefore appears a second time as a member of the next zone.
+    Vehicles on plain links follow at the end with `zone = NO_ZONE`.
 
     Fields:
-        x_m: Distance travelled since the zone's origin on this path, m.
+        x_m: Distance travelled since the zone's (or link's) origin on this path, m.
         v_mps: Speed, m/s.
         u_mps2: Acceleration applied over the step just ended, m/s^2 (0 before the first).
         entry_time_s: Instant at which the vehicle passed the zone's origin, s since the start of
             the run.
         entry_speed_mps: Speed at that instant, m/s.
-        planned_exit_time_s: Broadcast intent: instant at which the vehicle plans to pass the
-            conflict point, s (0 when it has no plan yet).
+        planned_exit_time_s: Broadcast intent: instant at which the vehicle plans to reach the end
+            of its path, s (0 when it has no plan yet).
         planned_exit_speed_mps: Broadcast intent: speed at that instant, m/s.
         length_m: Vehicle length, m.
         vehicle: Vehicle id, unique in the run, ascending with arrival.
         zone: Zone index, or `NO_ZONE` on a plain link.
-        path: Index of the path (approach) within the zone.
-        kind: Kind of vehicle: 0 CAV, 1 human-driven.
-        flags: Bit 0 entered, bit 1 index 0 (left), bit 2 left in the step just ended.
+        path: Index of the path within the zone; on a link, of the one it has come by.
+        next_zone: Zone it goes to next, or `NO_ZONE`.
+        next_path: Its path there, or `NO_PATH`.
+        then_path: Its path in the zone after that, or `NO_PATH`.
+        link: Index of the link it is on, or `NO_LINK`. Links are numbered by zone and exit they
+            begin at.
+        kind: Kind of vehicle: index in the scenario's fleet.
+        flags: Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3
+            human driver.
     """
 
     _fields_ = [
@@ -236,6 +252,10 @@ class VehicleState(ctypes.Structure):
         ("vehicle", ctypes.c_uint32),
         ("zone", ctypes.c_uint32),
         ("path", ctypes.c_uint32),
+        ("next_zone", ctypes.c_uint32),
+        ("next_path", ctypes.c_uint32),
+        ("then_path", ctypes.c_uint32),
+        ("link", ctypes.c_uint32),
         ("kind", ctypes.c_uint16),
         ("flags", ctypes.c_uint16),
     ]
@@ -243,35 +263,48 @@ class VehicleState(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
-        return "cz.VehicleState.v1"
+        return "cz.VehicleState.v2"
 
 
 class Assignment(ctypes.Structure):
     """One constraint of one vehicle, as the zone's coordinator decided it.
 
     A coordinator sends the whole list of each zone that acts in this step; it replaces what the
-    zone had before. Each member has at least one record; a path with several conflict points has
-    one per point.
+    zone had before. Each member has at least one record, and one per conflict point at which
+    somebody passes before it; members come in the order of the state frame. Between events the
+    positions of the two decide what is in force: nothing once the partner is at `until_m`; toward a
+    merging partner what is owed to a leader once the vehicle has passed the point; toward a
+    crossing one nothing from then on.
 
     Fields:
         own_conflict_m: Distance of the conflict point from the zone's origin on the vehicle's path,
-            m.
+            m. Toward a leader, of a place that both pass: what counts is the difference to the next
+            field.
         partner_conflict_m: The same point's distance from the origin on the partner's path, m.
+        gap_m: Distance delta to be kept to the partner beside phi v, m.
+        until_m: Position of the partner on its own path from which on nothing is owed to it, m;
+            infinite while the two drive on together.
         terminal_speed_mps: Terminal speed v_m the vehicle is to leave the zone with, m/s.
         vehicle: The vehicle bound by this record.
         partner: The vehicle it yields to, or `NO_VEHICLE`.
         zone: Zone index.
-        kind: 0 none, 1 rear end, 2 merge.
+        point: Index of the conflict point within the zone, or `NO_POINT`.
+        rank: Place of the vehicle in the zone's passing order, from 0.
+        kind: 0 none, 1 rear end, 2 merge, 3 cross.
         flags: Bit 0: the terminal speed is free.
     """
 
     _fields_ = [
         ("own_conflict_m", ctypes.c_double),
         ("partner_conflict_m", ctypes.c_double),
+        ("gap_m", ctypes.c_double),
+        ("until_m", ctypes.c_double),
         ("terminal_speed_mps", ctypes.c_double),
         ("vehicle", ctypes.c_uint32),
         ("partner", ctypes.c_uint32),
         ("zone", ctypes.c_uint32),
+        ("point", ctypes.c_uint32),
+        ("rank", ctypes.c_uint32),
         ("kind", ctypes.c_uint16),
         ("flags", ctypes.c_uint16),
     ]
@@ -279,7 +312,7 @@ class Assignment(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
-        return "cz.Assignment.v1"
+        return "cz.Assignment.v2"
 
 
 class ZoneSummary(ctypes.Structure):
@@ -315,27 +348,29 @@ class ZoneSummary(ctypes.Structure):
 class VehicleCommand(ctypes.Structure):
     """One vehicle's command for the step, and what its controller must remember.
 
-    Commands come in the order of the state frame. The `plan_*` fields and `mode` are the
-    controller's memory: with them a frame holds all that a controller needs to go on from it. A
-    controller of another kind may use them freely.
+    Commands come in the order of the state frame. `mode` and the memory words are the controller's
+    own: they mean what its law says, and with them a frame holds all that a controller needs to go
+    on from it.
 
     Fields:
         u_mps2: Acceleration over `[k * dt, (k + 1) * dt)`, m/s^2.
-        planned_exit_time_s: Broadcast intent: planned instant at the conflict point, s (0 when
+        planned_exit_time_s: Broadcast intent: planned instant at the end of the path, s (0 when
             there is no plan).
         planned_exit_speed_mps: Broadcast intent: planned speed there, m/s.
-        plan_start_s: Memory: instant at which the plan starts, s.
-        plan_origin_m: Memory: position at that instant, m.
-        plan_v0_mps: Memory: speed at that instant, m/s (coefficient c).
-        plan_a: Memory: coefficient a of u*(t) = a t + b, m/s^3.
-        plan_b: Memory: coefficient b, m/s^2.
-        plan_duration_s: Memory: duration T of the plan, s (0 when there is no plan).
-        plan_terminal_mps: Memory: terminal speed the plan was made for, m/s (-1 when it was free).
+        memory_0: Memory.
+        memory_1: Memory.
+        memory_2: Memory.
+        memory_3: Memory.
+        memory_4: Memory.
+        memory_5: Memory.
+        memory_6: Memory.
+        memory_7: Memory.
         vehicle: The vehicle.
         zone: Its zone.
         binding_rows: Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4
-            rear end, 5 rear-end feasibility, 6 merge, 7 merge feasibility.
-        mode: Memory: 0 entered, 1 FE, 2 OCBF.
+            rear end, 5 rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross
+            feasibility.
+        mode: Memory: 0 entered, 1 FE, 2 OCBF; other laws may have other modes.
         verdict: 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a
             deadline was missed, and refused from a controller: 4 held, 5 held within what the
             shield allows.
@@ -345,13 +380,14 @@ class VehicleCommand(ctypes.Structure):
         ("u_mps2", ctypes.c_double),
         ("planned_exit_time_s", ctypes.c_double),
         ("planned_exit_speed_mps", ctypes.c_double),
-        ("plan_start_s", ctypes.c_double),
-        ("plan_origin_m", ctypes.c_double),
-        ("plan_v0_mps", ctypes.c_double),
-        ("plan_a", ctypes.c_double),
-        ("plan_b", ctypes.c_double),
-        ("plan_duration_s", ctypes.c_double),
-        ("plan_terminal_mps", ctypes.c_double),
+        ("memory_0", ctypes.c_double),
+        ("memory_1", ctypes.c_double),
+        ("memory_2", ctypes.c_double),
+        ("memory_3", ctypes.c_double),
+        ("memory_4", ctypes.c_double),
+        ("memory_5", ctypes.c_double),
+        ("memory_6", ctypes.c_double),
+        ("memory_7", ctypes.c_double),
         ("vehicle", ctypes.c_uint32),
         ("zone", ctypes.c_uint32),
         ("binding_rows", ctypes.c_uint32),
@@ -362,7 +398,7 @@ class VehicleCommand(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
-        return "cz.VehicleCommand.v1"
+        return "cz.VehicleCommand.v2"
 
 
 class Member(ctypes.Structure):
@@ -479,8 +515,8 @@ class AttachReply(ctypes.Structure):
 class RunSpec(ctypes.Structure):
     """The numbers of a run: step, limits, distances, and the built-in law's gains.
 
-    The reply to a plug-in that joins carries one, then `approaches` records of `ApproachSpec`, then
-    for each of these a line of UTF-8 text, `ZONE.APPROACH`.
+    The reply to a plug-in that joins carries one, then `paths` records of `PathSpec`, then `kinds`
+    records of `KindSpec`, then for each path a line of UTF-8 text, `ZONE.PATH`.
 
     Fields:
         dt_s: Step length, s.
@@ -498,11 +534,13 @@ class RunSpec(ctypes.Structure):
         k_speed_per_s: Gain of the speed barriers, 1/s.
         clf_rate_per_s: Rate epsilon of the CLF row, 1/s.
         slack_weight: Weight lambda of the squared slack.
-        fe_fraction: Fraction of the approach within which FE mode may act.
+        fe_fraction: Fraction of the path within which FE mode may act.
         dt_ns: Step length, ns. Simulated time is `step * dt_ns`.
         seed: Seed of the run's random streams.
         zones: Number of zones.
-        approaches: Number of approaches, of all zones.
+        paths: Number of paths, of all zones.
+        kinds: Number of kinds of vehicles.
+        reserved: 0; room for what comes later.
         law_flags: Switches of the built-in law, one bit each.
         shield: 0 off, 1 observe, 2 on.
     """
@@ -527,7 +565,9 @@ class RunSpec(ctypes.Structure):
         ("dt_ns", ctypes.c_uint64),
         ("seed", ctypes.c_uint64),
         ("zones", ctypes.c_uint32),
-        ("approaches", ctypes.c_uint32),
+        ("paths", ctypes.c_uint32),
+        ("kinds", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
         ("law_flags", ctypes.c_uint32),
         ("shield", ctypes.c_uint32),
     ]
@@ -535,20 +575,21 @@ class RunSpec(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
-        return "cz.RunSpec.v1"
+        return "cz.RunSpec.v2"
 
 
-class ApproachSpec(ctypes.Structure):
-    """One approach of one zone; zones ascending, then paths.
+class PathSpec(ctypes.Structure):
+    """One path of one zone; zones ascending, then paths.
 
     Fields:
-        length_m: Distance from the zone's origin to the conflict point, m.
-        link_m: Length of the link behind the zone's exit, m (0: none).
+        length_m: Length from the zone's origin to its exit, m.
+        link_m: Length of the link behind the exit, m (0: none).
         zone: Zone index.
         path: Index of the path within the zone.
-        next_zone: Zone the exit leads to, or `NO_ZONE`.
-        next_path: Path within that zone.
-        controller: Index of the controller process that drives the approach.
+        exit: Index of the exit it leads to within the zone.
+        next_zone: Zone the exit leads to, or `NO_ZONE`. Which path a vehicle takes there is in its
+            `VehicleState`.
+        controller: Index of the controller process that drives the path.
         flags: Bit 0: the controller that asked drives it.
     """
 
@@ -557,8 +598,8 @@ class ApproachSpec(ctypes.Structure):
         ("link_m", ctypes.c_double),
         ("zone", ctypes.c_uint32),
         ("path", ctypes.c_uint32),
+        ("exit", ctypes.c_uint32),
         ("next_zone", ctypes.c_uint32),
-        ("next_path", ctypes.c_uint32),
         ("controller", ctypes.c_uint32),
         ("flags", ctypes.c_uint32),
     ]
@@ -566,7 +607,36 @@ class ApproachSpec(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
-        return "cz.ApproachSpec.v1"
+        return "cz.PathSpec.v2"
+
+
+class KindSpec(ctypes.Structure):
+    """One kind of vehicle, in the order of `VehicleState.kind`.
+
+    Fields:
+        u_min_mps2: Strongest braking, m/s^2, negative.
+        u_max_mps2: Strongest acceleration, m/s^2.
+        v_min_mps: Least speed, m/s.
+        v_max_mps: Greatest speed, m/s.
+        length_m: Length, m.
+        reaction_time_s: Reaction time phi, s.
+        standstill_gap_m: Standstill gap delta, m.
+    """
+
+    _fields_ = [
+        ("u_min_mps2", ctypes.c_double),
+        ("u_max_mps2", ctypes.c_double),
+        ("v_min_mps", ctypes.c_double),
+        ("v_max_mps", ctypes.c_double),
+        ("length_m", ctypes.c_double),
+        ("reaction_time_s", ctypes.c_double),
+        ("standstill_gap_m", ctypes.c_double),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        """Name under which the transport registers the type."""
+        return "cz.KindSpec.v1"
 
 
 #: All record types, in the order the schema hash covers them.
@@ -580,21 +650,23 @@ RECORDS = (
     AttachRequest,
     AttachReply,
     RunSpec,
-    ApproachSpec,
+    PathSpec,
+    KindSpec,
 )
 
 #: Name under which the transport registers each record type.
 TYPE_NAMES = {
     "FrameHeader": "cz.FrameHeader.v1",
-    "VehicleState": "cz.VehicleState.v1",
-    "Assignment": "cz.Assignment.v1",
+    "VehicleState": "cz.VehicleState.v2",
+    "Assignment": "cz.Assignment.v2",
     "ZoneSummary": "cz.ZoneSummary.v1",
-    "VehicleCommand": "cz.VehicleCommand.v1",
+    "VehicleCommand": "cz.VehicleCommand.v2",
     "Member": "cz.Member.v1",
     "AttachRequest": "cz.AttachRequest.v1",
     "AttachReply": "cz.AttachReply.v1",
-    "RunSpec": "cz.RunSpec.v1",
-    "ApproachSpec": "cz.ApproachSpec.v1",
+    "RunSpec": "cz.RunSpec.v2",
+    "PathSpec": "cz.PathSpec.v2",
+    "KindSpec": "cz.KindSpec.v1",
 }
 
 # Size, alignment and field offsets of each record, as Rust has them.
@@ -617,7 +689,7 @@ _LAYOUTS = {
         },
     ),
     VehicleState: (
-        80,
+        96,
         8,
         {
             "x_m": 0,
@@ -631,22 +703,30 @@ _LAYOUTS = {
             "vehicle": 64,
             "zone": 68,
             "path": 72,
-            "kind": 76,
-            "flags": 78,
+            "next_zone": 76,
+            "next_path": 80,
+            "then_path": 84,
+            "link": 88,
+            "kind": 92,
+            "flags": 94,
         },
     ),
     Assignment: (
-        40,
+        64,
         8,
         {
             "own_conflict_m": 0,
             "partner_conflict_m": 8,
-            "terminal_speed_mps": 16,
-            "vehicle": 24,
-            "partner": 28,
-            "zone": 32,
-            "kind": 36,
-            "flags": 38,
+            "gap_m": 16,
+            "until_m": 24,
+            "terminal_speed_mps": 32,
+            "vehicle": 40,
+            "partner": 44,
+            "zone": 48,
+            "point": 52,
+            "rank": 56,
+            "kind": 60,
+            "flags": 62,
         },
     ),
     ZoneSummary: (
@@ -662,24 +742,25 @@ _LAYOUTS = {
         },
     ),
     VehicleCommand: (
-        96,
+        104,
         8,
         {
             "u_mps2": 0,
             "planned_exit_time_s": 8,
             "planned_exit_speed_mps": 16,
-            "plan_start_s": 24,
-            "plan_origin_m": 32,
-            "plan_v0_mps": 40,
-            "plan_a": 48,
-            "plan_b": 56,
-            "plan_duration_s": 64,
-            "plan_terminal_mps": 72,
-            "vehicle": 80,
-            "zone": 84,
-            "binding_rows": 88,
-            "mode": 92,
-            "verdict": 94,
+            "memory_0": 24,
+            "memory_1": 32,
+            "memory_2": 40,
+            "memory_3": 48,
+            "memory_4": 56,
+            "memory_5": 64,
+            "memory_6": 72,
+            "memory_7": 80,
+            "vehicle": 88,
+            "zone": 92,
+            "binding_rows": 96,
+            "mode": 100,
+            "verdict": 102,
         },
     ),
     Member: (
@@ -727,7 +808,7 @@ _LAYOUTS = {
         },
     ),
     RunSpec: (
-        160,
+        168,
         8,
         {
             "dt_s": 0,
@@ -749,12 +830,14 @@ _LAYOUTS = {
             "dt_ns": 128,
             "seed": 136,
             "zones": 144,
-            "approaches": 148,
-            "law_flags": 152,
-            "shield": 156,
+            "paths": 148,
+            "kinds": 152,
+            "reserved": 156,
+            "law_flags": 160,
+            "shield": 164,
         },
     ),
-    ApproachSpec: (
+    PathSpec: (
         40,
         8,
         {
@@ -762,10 +845,23 @@ _LAYOUTS = {
             "link_m": 8,
             "zone": 16,
             "path": 20,
-            "next_zone": 24,
-            "next_path": 28,
+            "exit": 24,
+            "next_zone": 28,
             "controller": 32,
             "flags": 36,
+        },
+    ),
+    KindSpec: (
+        56,
+        8,
+        {
+            "u_min_mps2": 0,
+            "u_max_mps2": 8,
+            "v_min_mps": 16,
+            "v_max_mps": 24,
+            "length_m": 32,
+            "reaction_time_s": 40,
+            "standstill_gap_m": 48,
         },
     ),
 }

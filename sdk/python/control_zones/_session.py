@@ -37,7 +37,8 @@ class Run:
 
     Attributes:
         spec: `schemas.RunSpec`: step, limits, distances, gains.
-        approaches: list of `schemas.ApproachSpec`; names: `ZONE.APPROACH` of each.
+        paths: list of `schemas.PathSpec`; names: `ZONE.PATH` of each.
+        kinds: list of `schemas.KindSpec`, by `VehicleState.kind`.
         index: own index among the controller processes.
         lengths: `lengths[zone][path]`, m; own: set of (zone, path) this controller drives.
     """
@@ -48,17 +49,21 @@ class Run:
             raise Error(f"the world's reply has {len(data)} bytes, which is not a run specification")
         self.spec = s.RunSpec.from_buffer_copy(data)
         self.index = index
-        self.approaches = []
-        for _ in range(self.spec.approaches):
-            self.approaches.append(s.ApproachSpec.from_buffer_copy(data, size))
-            size += ctypes.sizeof(s.ApproachSpec)
+        self.paths = []
+        for _ in range(self.spec.paths):
+            self.paths.append(s.PathSpec.from_buffer_copy(data, size))
+            size += ctypes.sizeof(s.PathSpec)
+        self.kinds = []
+        for _ in range(self.spec.kinds):
+            self.kinds.append(s.KindSpec.from_buffer_copy(data, size))
+            size += ctypes.sizeof(s.KindSpec)
         self.names = bytes(data[size:]).decode().splitlines()
         self.lengths = {}
         self.zone_names = {}
-        for a, name in zip(self.approaches, self.names):
+        for a, name in zip(self.paths, self.names):
             self.lengths.setdefault(a.zone, {})[a.path] = a.length_m
             self.zone_names[a.zone] = name.split(".")[0]
-        self.own = {(a.zone, a.path) for a in self.approaches if a.flags & s.APPROACH_OWN}
+        self.own = {(a.zone, a.path) for a in self.paths if a.flags & s.PATH_OWN}
         self.own_zones = sorted({zone for zone, _ in self.own})
 
 

@@ -1,5 +1,7 @@
 """What a controller sees of one zone."""
 
+import typing
+
 from . import _schemas as s
 
 try:
@@ -24,15 +26,17 @@ class ZoneView:
         zone: index of the zone; name: its name.
         time: simulated time, s; dt: step length, s; step: its number.
         vehicle: ids.
-        path: index of each vehicle's approach.
+        path: index of each vehicle's path.
         x, v, u: position since the zone's origin, m; speed, m/s; acceleration over the step just ended.
         entry_time, entry_speed: at the zone's origin, s and m/s.
-        length: length of each vehicle's approach, m.
+        length: length of each vehicle's path, m.
         terminal: terminal speed to leave with, m/s; NaN where it is free.
-        ahead_x, ahead_v, ahead_u: the vehicle ahead on the same path; NaN where there is none.
-        merge_x, merge_v, merge_u: the vehicle of another path that passes the conflict point first,
-            in the vehicle's own coordinate; NaN where there is none.
-        merge_at: distance of the conflict point on the vehicle's own path, m.
+        ahead_x, ahead_v, ahead_u: the nearest vehicle ahead on the same way, in the vehicle's own coordinate; NaN
+            where there is none.
+        merge_x, merge_v, merge_u: the vehicle that passes the nearest conflict point first, in the vehicle's own
+            coordinate; NaN where there is none.
+        merge_at: distance of that conflict point on the vehicle's own path, m.
+        partners: for each vehicle a list of all it must respect where they are now, each a `Partner`.
         states: all records of the zone, index 0 (the vehicle that left it last) included.
         commands: the records that will be sent, the only array to be written to; `u_mps2` is filled from what
             the function returns, other fields, such as the planned exit, may be set here.
@@ -87,33 +91,51 @@ class ZoneView:
     def terminal(self):
         return self._once("terminal", lambda: _array(self._partners.terminal))
 
-    ahead_x = property(lambda self: self._partner("ahead", "x_m"))
-    ahead_v = property(lambda self: self._partner("ahead", "v_mps"))
-    ahead_u = property(lambda self: self._partner("ahead", "u_mps2"))
-    merge_x = property(lambda self: self._partner("merge", "x_m"))
-    merge_v = property(lambda self: self._partner("merge", "v_mps"))
-    merge_u = property(lambda self: self._partner("merge", "u_mps2"))
+    ahead_x = property(lambda self: self._nearest("ahead", "x"))
+    ahead_v = property(lambda self: self._nearest("ahead", "v"))
+    ahead_u = property(lambda self: self._nearest("ahead", "u"))
+    merge_x = property(lambda self: self._nearest("merge", "x"))
+    merge_v = property(lambda self: self._nearest("merge", "v"))
+    merge_u = property(lambda self: self._nearest("merge", "u"))
+    merge_at = property(lambda self: self._nearest("merge", "at"))
 
     @property
-    def merge_at(self):
-        return self._once("merge_at", lambda: _array(self._partners.merge_at))
+    def partners(self):
+        if "partners" not in self._cache:
+            self._cache["partners"] = self._partners.now(self.states, self.x)
+        return self._cache["partners"]
 
-    def _partner(self, kind, field):
-        def partners():
-            p = self._partners
-            places = p.ahead if kind == "ahead" else p.merge
-            shifts = p.merge_shift if kind == "merge" and field == "x_m" else [0.0] * len(places)
-            if numpy is None:
-                return [
-                    getattr(self.states[i], field) + shift if i >= 0 else NAN for i, shift in zip(places, shifts)
-                ]
-            places = numpy.asarray(places, dtype=int)
-            values = numpy.full(len(places), NAN)
-            there = places >= 0
-            values[there] = self.states[field][places[there]]
-            return values + numpy.asarray(shifts)
+    def _nearest(self, kind, field):
+        def nearest():
+            if kind == "ahead":
+                found = [min(_of(all_, True), key=lambda p: p.x, default=None) for all_ in self.partners]
+            else:
+                found = [min(_of(all_, False), key=lambda p: p.at, default=None) for all_ in self.partners]
+            return _array([NAN if p is None else getattr(p, field) for p in found])
 
-        return self._once((kind, field), partners)
+        return self._once((kind, field), nearest)
+
+
+class Partner(typing.NamedTuple):
+    """A vehicle that another must respect."""
+
+    #: `schemas.CONSTRAINT_REAR_END` (it drives ahead), `CONSTRAINT_MERGE` (it passes a merge first) or
+    #: `CONSTRAINT_CROSS` (it crosses first).
+    kind: int
+    #: Its id.
+    vehicle: int
+    #: Its position in the vehicle's own coordinate, m; its speed, m/s; its acceleration, m/s^2.
+    x: float
+    v: float
+    u: float
+    #: Distance of the conflict point on the vehicle's path, m; means nothing toward a leader.
+    at: float
+    #: Distance to be kept to it beside phi v, m.
+    gap: float
+
+
+def _of(partners, ahead):
+    return [p for p in partners if (p.kind == s.CONSTRAINT_REAR_END) == ahead]
 
 
 class Partners:
@@ -125,24 +147,40 @@ class Partners:
     def __init__(self, states, own, assignments):
         places = {int(states[i].vehicle): i for i in range(len(states))}
         order = {int(states[i].vehicle): n for n, i in enumerate(own)}
-        n = len(own)
-        self.terminal = [NAN] * n
-        self.ahead = [-1] * n
-        self.merge = [-1] * n
-        self.merge_shift = [0.0] * n
-        self.merge_at = [NAN] * n
+        self.terminal = [NAN] * len(own)
+        #: For each vehicle: place of the partner, its id, kind, distances of the point on the two paths, gap, and
+        #: from which position of the partner on nothing is owed.
+        self._owed = [[] for _ in own]
         for a in assignments:
             k = order.get(a.vehicle)
             if k is None:
                 continue
             if not a.flags & s.ASSIGNMENT_FREE_TERMINAL:
                 self.terminal[k] = a.terminal_speed_mps
-            if a.kind == s.CONSTRAINT_REAR_END:
-                self.ahead[k] = places.get(a.partner, -1)
-            elif a.kind == s.CONSTRAINT_MERGE:
-                self.merge[k] = places.get(a.partner, -1)
-                self.merge_shift[k] = a.own_conflict_m - a.partner_conflict_m
-                self.merge_at[k] = a.own_conflict_m
+            place = places.get(a.partner)
+            if place is not None and a.kind != s.CONSTRAINT_NONE:
+                owed = (place, a.partner, a.kind, a.own_conflict_m, a.partner_conflict_m, a.gap_m, a.until_m)
+                self._owed[k].append(owed)
+
+    def now(self, states, own_x):
+        """What is owed where the vehicles are: for each a list of `Partner`."""
+        if numpy is None:
+            at = [(r.x_m, r.v_mps, r.u_mps2) for r in states]
+        else:
+            at = list(zip(states["x_m"].tolist(), states["v_mps"].tolist(), states["u_mps2"].tolist()))
+        all_ = []
+        for x_own, owed in zip(own_x, self._owed):
+            partners = []
+            for place, vehicle, kind, own_m, partner_m, gap, until in owed:
+                x, v, u = at[place]
+                if x >= until or kind == s.CONSTRAINT_CROSS and x_own >= own_m:
+                    continue
+                # Behind the merge the one that passed it first is the leader.
+                if kind == s.CONSTRAINT_MERGE and x_own >= own_m:
+                    kind = s.CONSTRAINT_REAR_END
+                partners.append(Partner(kind, vehicle, x + own_m - partner_m, v, u, own_m, gap))
+            all_.append(partners)
+        return all_
 
 
 def _array(values):

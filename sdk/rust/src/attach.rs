@@ -2,7 +2,7 @@
 
 use crate::space::Space;
 use crate::space::failed;
-use crate::view::{Approach, Run};
+use crate::view::{Path, Run};
 use crate::{Error, Options, space};
 use iceoryx2::node::Node;
 use iceoryx2::port::publisher::Publisher;
@@ -10,7 +10,9 @@ use iceoryx2::port::subscriber::Subscriber;
 use iceoryx2::prelude::ServiceName;
 use iceoryx2::service::builder::publish_subscribe::PublishSubscribeOpenError as Open;
 use iceoryx2::service::ipc;
-use ipc_schemas::{self as frames, ApproachSpec, Assignment, AttachReply, AttachRequest, Record, RunSpec};
+use ipc_schemas::{
+    self as frames, Assignment, AttachReply, AttachRequest, KindSpec, PathSpec, Record, RunSpec,
+};
 use std::time::{Duration, Instant};
 
 const LOOK: Duration = Duration::from_millis(2);
@@ -190,17 +192,21 @@ fn read_run(all: &[u8], index: u32) -> Result<Run, Error> {
     let mut bytes = all;
     let spec: RunSpec = read(&mut bytes).ok_or_else(bad)?;
     let mut specs = Vec::new();
-    for _ in 0..spec.approaches {
-        specs.push(read::<ApproachSpec>(&mut bytes).ok_or_else(bad)?);
+    for _ in 0..spec.paths {
+        specs.push(read::<PathSpec>(&mut bytes).ok_or_else(bad)?);
+    }
+    let mut kinds = Vec::new();
+    for _ in 0..spec.kinds {
+        kinds.push(read::<KindSpec>(&mut bytes).ok_or_else(bad)?);
     }
     let text = std::str::from_utf8(bytes).map_err(|_| bad())?;
-    let approaches: Vec<Approach> = specs
+    let paths: Vec<Path> = specs
         .into_iter()
         .zip(text.lines())
-        .map(|(spec, name)| Approach { spec, name: name.to_owned() })
+        .map(|(spec, name)| Path { spec, name: name.to_owned() })
         .collect();
-    if approaches.len() != spec.approaches as usize {
+    if paths.len() != spec.paths as usize {
         return Err(bad());
     }
-    Run::new(spec, approaches, index).ok_or_else(bad)
+    Run::new(spec, paths, kinds, index).ok_or_else(bad)
 }

@@ -17,7 +17,7 @@ mod view;
 pub use inbox::Refused;
 pub use ipc_schemas as schemas;
 pub use session::{Commands, Session, Wake};
-pub use view::{Approach, Partner, Run, Step, Vehicle};
+pub use view::{Partner, PartnerKind, Path, Run, Step, Vehicle};
 
 use ipc_schemas::VehicleCommand;
 use std::time::Duration;

@@ -1,8 +1,8 @@
 //! What a controller sees.
 
 use ipc_schemas::{
-    self as frames, APPROACH_OWN, ASSIGNMENT_FREE_TERMINAL, ApproachSpec, Assignment, FrameHeader, RunSpec,
-    STATE_LEFT, VehicleState,
+    self as frames, ASSIGNMENT_FREE_TERMINAL, Assignment, FrameHeader, KindSpec, PATH_OWN, PathSpec, RunSpec,
+    VehicleState,
 };
 use std::ops::Range;
 
@@ -11,31 +11,33 @@ use std::ops::Range;
 pub struct Run {
     /// Step, limits, distances and gains.
     pub spec: RunSpec,
-    /// All approaches of all zones.
-    pub approaches: Vec<Approach>,
+    /// All paths of all zones.
+    pub paths: Vec<Path>,
+    /// Kinds of vehicles, by `VehicleState::kind`.
+    pub kinds: Vec<KindSpec>,
     /// Own index among the controller processes.
     pub index: u32,
-    /// Place of each zone's first approach, and behind the last one.
+    /// Place of each zone's first path, and behind the last one.
     first: Vec<u32>,
-    /// Zones of which this controller drives an approach, ascending.
+    /// Zones of which this controller drives a path, ascending.
     own_zones: Vec<u32>,
 }
 
-/// An approach and its name, `ZONE.APPROACH`.
+/// An path and its name, `ZONE.PATH`.
 #[derive(Clone, Debug)]
-pub struct Approach {
+pub struct Path {
     /// Its numbers.
-    pub spec: ApproachSpec,
+    pub spec: PathSpec,
     /// Its name.
     pub name: String,
 }
 
 impl Run {
-    /// A run of these approaches; nothing when they do not come zone by zone and path by path.
-    pub(crate) fn new(spec: RunSpec, approaches: Vec<Approach>, index: u32) -> Option<Run> {
+    /// A run of these paths; nothing when they do not come zone by zone and path by path.
+    pub(crate) fn new(spec: RunSpec, paths: Vec<Path>, kinds: Vec<KindSpec>, index: u32) -> Option<Run> {
         let mut first = Vec::new();
         let mut at = 0;
-        for group in approaches.chunk_by(|a, b| a.spec.zone == b.spec.zone) {
+        for group in paths.chunk_by(|a, b| a.spec.zone == b.spec.zone) {
             let in_order = (0..).zip(group).all(|(path, a)| a.spec.path == path);
             if !in_order || group[0].spec.zone as usize != first.len() {
                 return None;
@@ -47,26 +49,26 @@ impl Run {
             return None;
         }
         first.push(at);
-        let mut own_zones: Vec<u32> = approaches.iter().filter(|a| a.is_own()).map(|a| a.spec.zone).collect();
+        let mut own_zones: Vec<u32> = paths.iter().filter(|a| a.is_own()).map(|a| a.spec.zone).collect();
         own_zones.dedup();
-        Some(Run { spec, approaches, index, first, own_zones })
+        Some(Run { spec, paths, kinds, index, first, own_zones })
     }
 
-    /// The approach of a path of a zone.
-    pub fn approach(&self, zone: u32, path: u32) -> Option<&Approach> {
+    /// A path of a zone.
+    pub fn path(&self, zone: u32, path: u32) -> Option<&Path> {
         let [from, to] = *self.first.get(zone as usize..)?.first_chunk()?;
-        self.approaches.get(from.checked_add(path).filter(|at| *at < to)? as usize)
+        self.paths.get(from.checked_add(path).filter(|at| *at < to)? as usize)
     }
 
-    /// Whether this controller drives an approach.
+    /// Whether this controller drives a path.
     pub fn drives(&self, zone: u32, path: u32) -> bool {
-        self.approach(zone, path).is_some_and(Approach::is_own)
+        self.path(zone, path).is_some_and(Path::is_own)
     }
 }
 
-impl Approach {
+impl Path {
     fn is_own(&self) -> bool {
-        self.spec.flags & APPROACH_OWN != 0
+        self.spec.flags & PATH_OWN != 0
     }
 }
 
@@ -143,13 +145,13 @@ impl Board {
             // Assignments come in the order of the members.
             let mut next = 0;
             for (state, at) in slice.iter().zip(from as u32..) {
-                if state.flags & STATE_LEFT != 0 {
+                if state.has_left() {
                     continue;
                 }
                 let VehicleState { vehicle, path, .. } = *state;
                 let of_vehicle = zone.of_vehicle(vehicle, next);
                 next = of_vehicle.end;
-                if run.drives(number, path) {
+                if state.is_commanded() && run.drives(number, path) {
                     let slice = from as u32..(from + count) as u32;
                     let assignments = of_vehicle.start as u32..of_vehicle.end as u32;
                     self.members.push(Member { at, zone: number, path, slice, assignments });
@@ -223,7 +225,7 @@ impl<'a> Step<'a> {
             let bound = member.assignments.start as usize..member.assignments.end as usize;
             Vehicle {
                 state: &states[member.at as usize],
-                length_m: run.approach(member.zone, member.path).map_or(f64::NAN, |a| a.spec.length_m),
+                length_m: run.path(member.zone, member.path).map_or(f64::NAN, |a| a.spec.length_m),
                 assignments: &zone.assignments[bound.clone()],
                 partners: &zone.partners[bound],
                 slice: &states[member.slice.start as usize..member.slice.end as usize],
@@ -237,7 +239,7 @@ impl<'a> Step<'a> {
 pub struct Vehicle<'a> {
     /// Where it is.
     pub state: &'a VehicleState,
-    /// Length of its approach, m.
+    /// Length of its path, m.
     pub length_m: f64,
     /// Its constraints, as the coordinator sent them.
     pub assignments: &'a [Assignment],
@@ -251,12 +253,25 @@ pub struct Vehicle<'a> {
 pub struct Partner<'a> {
     /// Its record in the same zone.
     pub state: &'a VehicleState,
+    /// What is owed to it now.
+    pub kind: PartnerKind,
     /// Its position in the vehicle's own coordinate, m.
     pub x_m: f64,
-    /// Distance of the shared conflict point on the vehicle's path, m.
+    /// Distance of the conflict point on the vehicle's path, m; means nothing toward a leader.
     pub conflict_m: f64,
-    /// Whether it merges from another path; it drives ahead on the same one otherwise.
-    pub merges: bool,
+    /// Distance delta to be kept to it beside phi v, m.
+    pub gap_m: f64,
+}
+
+/// What is owed to a partner.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PartnerKind {
+    /// It drives ahead: the distance is kept at every instant.
+    RearEnd,
+    /// It passes a merge first: the distance is kept from the instant at which the vehicle passes it.
+    Merge,
+    /// It crosses first: the distance is kept at the instant at which the vehicle reaches the crossing.
+    Cross,
 }
 
 impl<'a> Vehicle<'a> {
@@ -266,16 +281,26 @@ impl<'a> Vehicle<'a> {
         (a.flags & ASSIGNMENT_FREE_TERMINAL == 0).then_some(a.terminal_speed_mps)
     }
 
-    /// The vehicles it must respect.
+    /// The vehicles it must respect where they are now.
     pub fn partners(&self) -> impl Iterator<Item = Partner<'a>> + use<'a> {
-        let slice = self.slice;
+        let (slice, own_m) = (self.slice, self.state.x_m);
         self.assignments.iter().zip(self.partners).filter_map(move |(a, place)| {
             let state = slice.get(*place as usize).filter(|s| s.vehicle == a.partner)?;
+            let kind = match a.kind {
+                _ if state.x_m >= a.until_m => return None,
+                frames::CONSTRAINT_REAR_END => PartnerKind::RearEnd,
+                // Behind the merge the one that passed it first is the leader.
+                frames::CONSTRAINT_MERGE if own_m >= a.own_conflict_m => PartnerKind::RearEnd,
+                frames::CONSTRAINT_MERGE => PartnerKind::Merge,
+                frames::CONSTRAINT_CROSS if own_m < a.own_conflict_m => PartnerKind::Cross,
+                _ => return None,
+            };
             Some(Partner {
                 state,
+                kind,
                 x_m: state.x_m + a.own_conflict_m - a.partner_conflict_m,
                 conflict_m: a.own_conflict_m,
-                merges: a.kind == frames::CONSTRAINT_MERGE,
+                gap_m: a.gap_m,
             })
         })
     }
@@ -284,20 +309,19 @@ impl<'a> Vehicle<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use ipc_schemas::{NO_VEHICLE, NO_ZONE, STATE_ENTERED};
+    use ipc_schemas::{NO_VEHICLE, NO_ZONE, STATE_ENTERED, STATE_LEFT};
 
-    /// Three zones of two approaches each; the controller drives all of zone 0 and one approach of zone 2.
+    /// Three zones of two paths each; the controller drives all of zone 0 and one path of zone 2.
     fn run() -> Run {
-        let approach = |zone, path| {
-            let flags = if zone == 0 || (zone, path) == (2, 1) { APPROACH_OWN } else { 0 };
+        let path = |zone, path| {
+            let flags = if zone == 0 || (zone, path) == (2, 1) { PATH_OWN } else { 0 };
             let length_m = f64::from(100 + 10 * zone + path);
-            let spec = ApproachSpec { zone, path, flags, length_m, ..ApproachSpec::default() };
-            Approach { spec, name: format!("z{zone}.a{path}") }
+            let spec = PathSpec { zone, path, flags, length_m, ..PathSpec::default() };
+            Path { spec, name: format!("z{zone}.a{path}") }
         };
-        let approaches: Vec<_> =
-            (0..3).flat_map(|zone| (0..2).map(move |path| approach(zone, path))).collect();
-        let spec = RunSpec { zones: 3, approaches: 6, ..RunSpec::default() };
-        Run::new(spec, approaches, 1).expect("they come in order")
+        let paths: Vec<_> = (0..3).flat_map(|zone| (0..2).map(move |path| path(zone, path))).collect();
+        let spec = RunSpec { zones: 3, paths: 6, ..RunSpec::default() };
+        Run::new(spec, paths, Vec::new(), 1).expect("they come in order")
     }
 
     /// In each zone one that left and five members whose ids do not ascend; a vehicle on a link at the end.
@@ -328,6 +352,7 @@ mod tests {
                         zone,
                         kind,
                         own_conflict_m: 3.0,
+                        until_m: f64::INFINITY,
                         ..Assignment::default()
                     });
                 }
@@ -389,13 +414,13 @@ mod tests {
     }
 
     #[test]
-    fn approaches_out_of_order_are_no_run() {
+    fn paths_out_of_order_are_no_run() {
         let good = run();
-        let mut swapped = good.approaches.clone();
+        let mut swapped = good.paths.clone();
         swapped.swap(0, 1);
-        assert!(Run::new(good.spec, swapped, 0).is_none());
-        assert!(Run::new(RunSpec { zones: 4, ..good.spec }, good.approaches.clone(), 0).is_none());
-        assert!(good.approach(2, 2).is_none() && good.approach(3, 0).is_none());
-        assert!(good.approach(0, u32::MAX).is_none() && good.approach(u32::MAX, 0).is_none());
+        assert!(Run::new(good.spec, swapped, Vec::new(), 0).is_none());
+        assert!(Run::new(RunSpec { zones: 4, ..good.spec }, good.paths.clone(), Vec::new(), 0).is_none());
+        assert!(good.path(2, 2).is_none() && good.path(3, 0).is_none());
+        assert!(good.path(0, u32::MAX).is_none() && good.path(u32::MAX, 0).is_none());
     }
 }

@@ -560,7 +560,10 @@ mod tests {
         assert_eq!(names, ["x", "first", "mid", "last"]);
         assert_eq!(n.zones[3].segments[0].source, Some(Source::Zone { zone: 2, exit: 0 }));
         assert_eq!(n.zones[2].segments[0].source, Some(Source::Zone { zone: 1, exit: 0 }));
-        assert_eq!(n.zones[1].exits[0].to, Some(Downstream { zone: 2, segment: 0, link_m: 0.0, link_speed_mps: 15.0 }));
+        assert_eq!(
+            n.zones[1].exits[0].to,
+            Some(Downstream { zone: 2, segment: 0, link_m: 0.0, link_speed_mps: 15.0 })
+        );
         assert_eq!(n.zones[0].exits[0].to, None);
         for (index, road) in n.roads.iter().enumerate() {
             let entrance = &n.zones[road.zone as usize].segments[road.segment as usize];

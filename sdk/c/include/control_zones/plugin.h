@@ -53,9 +53,9 @@ typedef struct cz_plugin cz_plugin_t;
 /** One vehicle to be commanded, with its partners looked up. */
 typedef struct cz_vehicle {
     const cz_vehicle_state_t *state; /**< its record in the state frame */
-    const cz_vehicle_state_t *ahead; /**< the vehicle ahead on the same path, or NULL */
-    const cz_vehicle_state_t *merge; /**< the one of another path that passes first, or NULL */
-    double length_m;     /**< length of its approach, m */
+    const cz_vehicle_state_t *ahead; /**< the nearest vehicle ahead on its way, or NULL */
+    const cz_vehicle_state_t *merge; /**< the one that passes the nearest conflict point first, or NULL */
+    double length_m;     /**< length of its path, m */
     double terminal_mps; /**< terminal speed to leave with, m/s; NaN when it is free */
     double ahead_x_m;    /**< position of ahead in the vehicle's own coordinate, m, or NaN */
     double merge_x_m;    /**< position of merge in the vehicle's own coordinate, m, or NaN */
@@ -68,6 +68,15 @@ static_assert(sizeof(cz_vehicle_t) == 40 + 3 * sizeof(void *), "cz_vehicle_t as 
 _Static_assert(sizeof(cz_vehicle_t) == 40 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
 #endif
 
+/** A vehicle that another must respect where the two are now. */
+typedef struct cz_partner {
+    const cz_vehicle_state_t *state; /**< its record in the state frame */
+    double x_m;    /**< its position in the vehicle's own coordinate, m */
+    double at_m;   /**< distance of the conflict point on the vehicle's path, m; means nothing toward a leader */
+    double gap_m;  /**< distance to be kept to it beside phi v, m */
+    uint64_t kind; /**< CZ_CONSTRAINT_REAR_END, CZ_CONSTRAINT_MERGE or CZ_CONSTRAINT_CROSS */
+} cz_partner_t;
+
 /** Joins a run. NULL names stand for the environment's CZ_RUN and CZ_CONTROLLER. NULL on failure. */
 cz_plugin_t *cz_attach(const char *run, const char *controller, double timeout_s);
 /** Leaves the run. NULL is allowed. */
@@ -78,16 +87,18 @@ const char *cz_last_error(void);
 int cz_wait(cz_plugin_t *plugin, double timeout_s);
 /** The run's numbers; valid until detached. */
 const cz_run_spec_t *cz_run_spec(const cz_plugin_t *plugin);
-/** All approaches; valid until detached. */
-const cz_approach_spec_t *cz_approaches(const cz_plugin_t *plugin, size_t *count);
-/** Name of an approach, ZONE.APPROACH; NULL beyond the last. Valid until detached. */
-const char *cz_approach_name(const cz_plugin_t *plugin, size_t index);
+/** All paths; valid until detached. */
+const cz_path_spec_t *cz_paths(const cz_plugin_t *plugin, size_t *count);
+/** Name of a path, ZONE.PATH; NULL beyond the last. Valid until detached. */
+const char *cz_path_name(const cz_plugin_t *plugin, size_t index);
 /** Header of the state frame; valid until cz_send. */
 const cz_frame_header_t *cz_header(const cz_plugin_t *plugin);
 /** The state frame, all zones; valid until cz_send. */
 const cz_vehicle_state_t *cz_states(const cz_plugin_t *plugin, size_t *count);
 /** The vehicles to be commanded, in the order of the commands; valid until cz_send. */
 const cz_vehicle_t *cz_vehicles(const cz_plugin_t *plugin, size_t *count);
+/** All vehicles that the one at this place among cz_vehicles must respect; valid until cz_send. */
+const cz_partner_t *cz_partners(const cz_plugin_t *plugin, size_t vehicle, size_t *count);
 /** The coordination in force in a zone; valid until the next cz_wait. */
 const cz_assignment_t *cz_assignments(const cz_plugin_t *plugin, uint32_t zone, size_t *count);
 /** Lends the command frame, vehicles and zones filled in, accelerations 0; valid until cz_send. */

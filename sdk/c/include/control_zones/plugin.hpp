@@ -69,7 +69,7 @@ public:
     const cz_run_spec_t &spec() const { return *cz_run_spec(plugin_.get()); }
     const cz_frame_header_t &header() const { return *cz_header(plugin_.get()); }
     double time_s() const { return static_cast<double>(header().time_ns) * 1e-9; }
-    Range<const cz_approach_spec_t> approaches() const { return range(cz_approaches); }
+    Range<const cz_path_spec_t> paths() const { return range(cz_paths); }
     Range<const cz_vehicle_state_t> states() const { return range(cz_states); }
     Range<const cz_vehicle_t> vehicles() const { return range(cz_vehicles); }
 
