@@ -3,9 +3,9 @@
 #![allow(clippy::unwrap_used)] // a test
 
 use control_zones::lockstep::in_process::InProcess;
-use control_zones::scenario::{Override, Scenario, load};
+use control_zones::scenario::{Override, PassingOrder, Scenario, load};
 use control_zones::world::{ShieldRow, World};
-use ipc_schemas::{STATE_LEFT, VehicleCommand, VehicleState};
+use ipc_schemas::{VehicleCommand, VehicleState};
 use std::sync::Arc;
 
 const VEHICLE_STEPS: u64 = 1_000_000;
@@ -55,7 +55,7 @@ fn attack(
         let step = world.step();
         let commands: Vec<VehicleCommand> = world
             .records()
-            .filter(|s| s.zone != ipc_schemas::NO_ZONE && s.flags & STATE_LEFT == 0)
+            .filter(VehicleState::is_commanded)
             .map(|s| VehicleCommand {
                 u_mps2: adversary(step, &s),
                 vehicle: s.vehicle,
@@ -140,6 +140,105 @@ fn withstands_them_in_a_tree_and_a_corridor() {
     for network in ["tree", "corridor-8"] {
         withstands(network, always_u_max);
         withstands(network, leaders_that_stop);
+    }
+}
+
+/// An embedded scenario under another rate on every road, until the given number of vehicles has come.
+fn busy(name: &str, shield: &str, rate: f64, vehicles: u32) -> Arc<Scenario> {
+    let base = load(Some(name), &[], None).unwrap();
+    let mut sets = vec![
+        format!("shield={shield}"),
+        "end.time_s=40000".to_owned(),
+        format!("end.vehicles={vehicles}"),
+    ];
+    for road in &base.network.roads {
+        let rates = format!("[{{until_s=40000.0, vehicles_per_hour={rate}}}]");
+        sets.push(format!("roads.{}.demand.rates={rates}", road.name));
+    }
+    let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
+    Arc::new(load(Some(name), &sets, Some(1)).unwrap())
+}
+
+/// Where paths cross, come together on shared lanes and part again, and around circles of zones.
+fn withstands_where_paths_cross<A: FnMut(u64, &VehicleState) -> f64>(adversary: impl Fn() -> A) {
+    for (network, rate) in [("intersection", 300.0), ("roundabout", 400.0), ("grid-3x3", 200.0)] {
+        let (row, commanded, world) = attack(&busy(network, "on", rate, u32::MAX), VEHICLE_STEPS, adversary());
+        assert!(commanded >= VEHICLE_STEPS, "{network}: only {commanded} vehicle-steps");
+        println!("{network}: {row:?}, {:?}", world.summary().overlaps);
+        assert_eq!(row.lost, 0, "{network}");
+        for (what, margin) in [
+            ("rear end", row.min_rear_end_margin_m),
+            ("merge", row.min_merge_margin_m),
+            ("cross", row.min_cross_margin_m),
+        ] {
+            assert!(margin.is_none_or(|m| m >= 0.0), "{network}: {what} {margin:?}");
+        }
+        assert!(row.rear_end > 0 && row.merge > 0, "{network}");
+        assert!(network == "roundabout" || row.cross > 0, "{network}");
+    }
+}
+
+#[test]
+fn withstands_full_acceleration_where_paths_cross() {
+    withstands_where_paths_cross(always_u_max);
+}
+
+#[test]
+fn withstands_random_flips_where_paths_cross() {
+    withstands_where_paths_cross(random_flips);
+}
+
+#[test]
+fn withstands_leaders_that_stop_where_paths_cross() {
+    withstands_where_paths_cross(leaders_that_stop);
+}
+
+/// Under more demand than they carry: everybody gets through, whichever the order, and nobody touches.
+#[test]
+fn traffic_never_locks_up() {
+    for network in ["intersection", "roundabout", "lane-drop", "grid-3x3"] {
+        for order in ["fifo", "per_point"] {
+            let base = busy(network, "on", 900.0, 400);
+            let mut scenario = (*base).clone();
+            for zone in &mut scenario.network.zones {
+                zone.order = if order == "fifo" { PassingOrder::Fifo } else { PassingOrder::PerPoint };
+            }
+            let summary = built_in(&Arc::new(scenario));
+            let ShieldRow { lost, began_unsafe, .. } = summary.shield.controllers[0];
+            println!(
+                "{network}, {order}: {} steps, {} of {} left, {began_unsafe} began unsafe, {:?}, orders refused {}",
+                summary.steps,
+                summary.departed,
+                summary.arrived,
+                summary.overlaps,
+                summary.zones.iter().map(|z| z.orders_refused).sum::<u32>()
+            );
+            assert_eq!((summary.departed, summary.waiting), (400, 0), "{network}, {order}");
+            assert_eq!(lost, 0, "{network}, {order}");
+        }
+    }
+}
+
+/// However the roles are shared out.
+#[test]
+fn one_hash_where_paths_cross() {
+    for network in ["intersection", "roundabout", "lane-drop", "grid-3x3"] {
+        for order in [PassingOrder::Fifo, PassingOrder::PerPoint] {
+            let mut scenario = load(Some(network), &[], None).unwrap();
+            scenario.max_vehicles = Some(60);
+            scenario.network.zones.iter_mut().for_each(|zone| zone.order = order);
+            let scenario = Arc::new(scenario);
+            let zones = scenario.network.zones.len() as u32;
+            let hash = |coordinators: u32, controllers: u32| {
+                let mut run = InProcess::new(&scenario, coordinators.min(zones), controllers.min(zones));
+                run.run().unwrap();
+                run.world().summary().state_hash
+            };
+            let expected = hash(1, 1);
+            for (coordinators, controllers) in [(2, 1), (1, 2), (3, 3), (9, 4)] {
+                assert_eq!(hash(coordinators, controllers), expected, "{network}, {order:?}");
+            }
+        }
     }
 }
 

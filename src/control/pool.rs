@@ -514,7 +514,7 @@ mod tests {
             let refused = judge(Assignment { terminal_speed_mps: speed, ..good });
             assert_eq!(refused, Err(PoolError::Malformed { zone: 0, vehicle: 0 }), "{speed}");
         }
-        for m in [f64::NAN, 0.0, -200.0, 1e300] {
+        for m in [f64::NAN, -200.0, 1e300] {
             assert!(judge(Assignment { own_conflict_m: m, ..good }).is_err(), "{m}");
             assert!(judge(Assignment { partner_conflict_m: m, ..good }).is_err(), "{m}");
         }
