@@ -146,11 +146,8 @@ fn withstands_them_in_a_tree_and_a_corridor() {
 /// An embedded scenario under another rate on every road, until the given number of vehicles has come.
 fn busy(name: &str, shield: &str, rate: f64, vehicles: u32) -> Arc<Scenario> {
     let base = load(Some(name), &[], None).unwrap();
-    let mut sets = vec![
-        format!("shield={shield}"),
-        "end.time_s=40000".to_owned(),
-        format!("end.vehicles={vehicles}"),
-    ];
+    let mut sets =
+        vec![format!("shield={shield}"), "end.time_s=40000".to_owned(), format!("end.vehicles={vehicles}")];
     for road in &base.network.roads {
         let rates = format!("[{{until_s=40000.0, vehicles_per_hour={rate}}}]");
         sets.push(format!("roads.{}.demand.rates={rates}", road.name));
@@ -162,7 +159,8 @@ fn busy(name: &str, shield: &str, rate: f64, vehicles: u32) -> Arc<Scenario> {
 /// Where paths cross, come together on shared lanes and part again, and around circles of zones.
 fn withstands_where_paths_cross<A: FnMut(u64, &VehicleState) -> f64>(adversary: impl Fn() -> A) {
     for (network, rate) in [("intersection", 300.0), ("roundabout", 400.0), ("grid-3x3", 200.0)] {
-        let (row, commanded, world) = attack(&busy(network, "on", rate, u32::MAX), VEHICLE_STEPS, adversary());
+        let (row, commanded, world) =
+            attack(&busy(network, "on", rate, u32::MAX), VEHICLE_STEPS, adversary());
         assert!(commanded >= VEHICLE_STEPS, "{network}: only {commanded} vehicle-steps");
         println!("{network}: {row:?}, {:?}", world.summary().overlaps);
         assert_eq!(row.lost, 0, "{network}");

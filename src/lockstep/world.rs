@@ -461,6 +461,7 @@ where
                     missing.coordination &= !(1 << header.sender_index);
                     if let Some(ledger) = &mut self.ledger {
                         ledger.coordinate(header.sender_index, &self.judged_coordination);
+                        self.world.coordinate(&self.judged_coordination);
                     }
                     return Ok(true);
                 }

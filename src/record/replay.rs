@@ -254,6 +254,7 @@ impl WorldReplay {
         if step.commands.len() != senders {
             return Err(refused(format!("they are of {} controllers, not {senders}", step.commands.len())));
         }
+        world.coordinate(&step.coordination);
         for (index, part) in (0..).zip(&step.commands) {
             let taken = match step.missed(index as usize) {
                 true => world.put_in(index, &part.records),
