@@ -106,8 +106,7 @@ def intersection():
                 last = on_way[-1]
                 shape = [back(FIRST_POINT_M - SPLIT_M), *on_way]
                 if turn == "left":
-                    ex, ey = HEADING[leg][1] * -1, HEADING[leg][0]
-                    ex, ey = (dy * -1, dx) if False else (-dy, dx)
+                    ex, ey = -dy, dx
                     shape.append((last[0] + 8 * ex, last[1] + 8 * ey))
                 name = f"{leg}-{turn}"
                 inner = FIRST_POINT_M - SPLIT_M
@@ -163,10 +162,9 @@ def roundabout():
         a0, a1 = 2 * math.pi * i / 3, 2 * math.pi * (i + 1) / 3
         mid = (a0 + a1) / 2
         first, second = arc((0, 0), radius, a0, mid), arc((0, 0), radius, mid, a1)
-        tangent = (-math.sin(mid), math.cos(mid))
         out = [first[-1]]
         for step in range(1, 4):
-            bend = mid + math.pi / 2 - 0.25 * step
+            bend = mid + math.pi / 2 - 0.5 * step
             out.append((out[-1][0] + 10 * math.cos(bend), out[-1][1] + 10 * math.sin(bend)))
         merge = second[-1]
         entry = [merge]
@@ -198,7 +196,6 @@ def roundabout():
                 '{ name = "enter", segments = ["entry"], exit = "ring" }',
             ],
         )
-        del tangent
     (HERE / "roundabout.toml").write_text(text)
 
 

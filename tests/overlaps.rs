@@ -77,10 +77,10 @@ fn corridor(zones: &[([f64; 2], f64)], seed: u64) -> Arc<Scenario> {
     Arc::new(load_given(&text, Vec::new(), &[], Some(seed)).unwrap())
 }
 
-/// Where a vehicle is: a zone and approach, or the link behind a zone.
+/// Where a vehicle is: a zone and path, or the link behind a zone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Place {
-    Approach(u32, u32),
+    Path(u32, u32),
     Link(u32),
 }
 
@@ -98,13 +98,10 @@ struct Oracle {
 impl Oracle {
     fn length_m(scenario: &Scenario, place: Place) -> f64 {
         match place {
-            Place::Approach(zone, path) => {
-                scenario.network.zones[zone as usize].paths[path as usize].length_m
+            Place::Path(zone, path) => scenario.network.zones[zone as usize].paths[path as usize].length_m,
+            Place::Link(zone) => {
+                scenario.network.zones[zone as usize].exits[0].to.map_or(0.0, |to| to.link_m)
             }
-            Place::Link(zone) => match scenario.network.zones[zone as usize].exit {
-                control_zones::scenario::Exit::Zone { link_m, .. } => link_m,
-                control_zones::scenario::Exit::Out => 0.0,
-            },
         }
     }
 
@@ -114,8 +111,8 @@ impl Oracle {
             let way = self.ways.entry(s.vehicle).or_default();
             let before = way.last().map(|(place, _)| *place);
             let place = match before {
-                _ if s.zone != NO_ZONE => Place::Approach(s.zone, s.path),
-                Some(Place::Approach(zone, _)) => Place::Link(zone),
+                _ if s.zone != NO_ZONE => Place::Path(s.zone, s.path),
+                Some(Place::Path(zone, _)) => Place::Link(zone),
                 Some(link) => link,
                 None => unreachable!("nobody begins on a link"),
             };
@@ -162,7 +159,7 @@ fn drive(scenario: &Arc<Scenario>, seed: u64) -> (OverlapSummary, Oracle) {
             .map(|s| {
                 let draw =
                     (seed ^ (u64::from(s.vehicle) << 32) ^ (step / 12)).wrapping_mul(0x9e37_79b9_7f4a_7c15);
-                let draw = (draw ^ draw >> 29).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 40;
+                let draw = (draw ^ (draw >> 29)).wrapping_mul(0xbf58_476d_1ce4_e5b9) >> 40;
                 let wish = draw as f64 / f64::from(1u32 << 24) * 8.0 - 4.0;
                 let u_mps2 = if s.v_mps < 3.0 { wish.abs() } else { wish.min((25.0 - s.v_mps) / DT_S) };
                 VehicleCommand {

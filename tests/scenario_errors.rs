@@ -814,7 +814,7 @@ fn counts_fit_16_bits() {
 
 #[test]
 fn sets_reach_what_they_name() {
-    use control_zones::scenario::{Baseline, Demand, FlowPolicy, Replan, Segment};
+    use control_zones::scenario::{Baseline, Demand, FlowPolicy, Observed, Replan};
     assert_eq!(with(&["control.replan=from_state"]).control.replan, Replan::FromState);
     assert_eq!(with(&["control.replan=\"from_state\""]).control.replan, Replan::FromState);
     assert_eq!(with(&["end={vehicles=3}"]).max_vehicles, Some(3));

@@ -125,40 +125,25 @@ impl Picture {
         area: DrawingArea<DB, Shift>,
     ) -> Result<(), DrawingAreaErrorKind<DB::ErrorType>> {
         area.fill(&WHITE)?;
+        let (width, height) = area.dim_in_pixel();
         let (low, high) = self.bounds();
-        let scale = SIZE_PX / (high.0 - low.0).max(high.1 - low.1).max(1.0);
-        let (_, height) = area.dim_in_pixel();
-        let px = |p: &Place| {
-            let x = (p.0 - low.0) * scale + MARGIN_PX;
-            let y = f64::from(height) - MARGIN_PX - (p.1 - low.1) * scale;
-            (x as i32, y as i32)
-        };
-        for link in &self.links {
-            area.draw(&PathElement::new(
-                link.iter().map(px).collect::<Vec<_>>(),
-                LANE.mix(0.4).stroke_width(2),
-            ))?;
-        }
-        for (shape, color) in &self.lanes {
-            let line: Vec<(i32, i32)> = shape.iter().map(px).collect();
-            area.draw(&PathElement::new(line.clone(), color.stroke_width(3)))?;
-            area.draw(&Polygon::new(arrow(&line), color.filled()))?;
-        }
-        let text = |place: (i32, i32), text: &str, color: RGBColor, size: u32| {
-            let style =
-                ("sans-serif", size).into_font().color(&color).pos(Pos::new(HPos::Center, VPos::Bottom));
-            area.draw(&Text::new(text.to_owned(), (place.0, place.1 - 6), style))
-        };
-        for (place, kind, name) in &self.points {
-            let color = if *kind == PointKind::Merge { MERGE } else { CROSSING };
-            area.draw(&Circle::new(px(place), 5, color.filled()))?;
-            // In a large network names would only cover each other.
-            if self.points.len() <= 30 && *kind == PointKind::Crossing {
-                text(px(place), name, color, 13)?;
-            }
-        }
-        for (place, name, color) in &self.labels {
-            text(px(place), name, *color, 15)?;
+        let margin = MARGIN_PX as i32;
+        let whole =
+            View::new((low, high), (margin, margin), (width as i32 - 2 * margin, height as i32 - 2 * margin));
+        self.draw_view(&area, &whole, false)?;
+        // Where conflicts are close together they are shown again, enlarged, in an empty corner.
+        let (near, far) = self.points.iter().fold((high, low), |(near, far), (p, ..)| {
+            ((near.0.min(p.0), near.1.min(p.1)), (far.0.max(p.0), far.1.max(p.1)))
+        });
+        let extent = (far.0 - near.0).max(far.1 - near.1);
+        if extent > 0.0 && extent < 0.2 * (high.0 - low.0).min(high.1 - low.1) {
+            let room = 0.35 * extent;
+            let bounds = ((near.0 - room, near.1 - room), (far.0 + room, far.1 + room));
+            let side = (0.42 * f64::from(width.min(height))) as i32;
+            let place = (10, height as i32 - side - 10);
+            area.draw(&Rectangle::new([place, (place.0 + side, place.1 + side)], WHITE.filled()))?;
+            area.draw(&Rectangle::new([place, (place.0 + side, place.1 + side)], LANE.stroke_width(1)))?;
+            self.draw_view(&area, &View::new(bounds, place, (side, side)), true)?;
         }
         let legend = [
             ("entrance", ENTRANCE),
@@ -175,12 +160,98 @@ impl Picture {
         }
         area.present()
     }
+
+    fn draw_view<DB: DrawingBackend>(
+        &self,
+        area: &DrawingArea<DB, Shift>,
+        view: &View,
+        is_inset: bool,
+    ) -> Result<(), DrawingAreaErrorKind<DB::ErrorType>> {
+        let text = |place: (i32, i32), text: &str, color: RGBColor, size: u32| {
+            let style =
+                ("sans-serif", size).into_font().color(&color).pos(Pos::new(HPos::Center, VPos::Bottom));
+            area.draw(&Text::new(text.to_owned(), (place.0, place.1 - 6), style))
+        };
+        for [from, to] in &self.links {
+            if let Some(line) = view.line(*from, *to) {
+                area.draw(&PathElement::new(line.to_vec(), LANE.mix(0.4).stroke_width(2)))?;
+            }
+        }
+        for (shape, color) in &self.lanes {
+            let lines: Vec<[(i32, i32); 2]> =
+                shape.windows(2).filter_map(|w| view.line(w[0], w[1])).collect();
+            for line in &lines {
+                area.draw(&PathElement::new(line.to_vec(), color.stroke_width(3)))?;
+            }
+            if let Some(line) = lines.get(lines.len() / 2) {
+                area.draw(&Polygon::new(arrow(line), color.filled()))?;
+            }
+        }
+        for (place, kind, name) in self.points.iter().filter(|(place, ..)| view.holds(*place)) {
+            let color = if *kind == PointKind::Merge { MERGE } else { CROSSING };
+            area.draw(&Circle::new(view.px(*place), 5, color.filled()))?;
+            if is_inset && self.points.len() <= 30 {
+                text(view.px(*place), name, color, 14)?;
+            }
+        }
+        for (place, name, color) in self.labels.iter().filter(|_| !is_inset) {
+            text(view.px(*place), name, *color, 15)?;
+        }
+        Ok(())
+    }
+}
+
+/// A part of the plane, and where it is drawn.
+struct View {
+    low: Place,
+    high: Place,
+    /// Upper left corner, and height, pixels.
+    corner: (i32, i32),
+    height: f64,
+    scale: f64,
+}
+
+impl View {
+    fn new((low, high): (Place, Place), corner: (i32, i32), (width, height): (i32, i32)) -> View {
+        let scale_x = f64::from(width) / (high.0 - low.0).max(1.0);
+        let scale_y = f64::from(height) / (high.1 - low.1).max(1.0);
+        View { low, high, corner, height: f64::from(height), scale: scale_x.min(scale_y) }
+    }
+
+    fn px(&self, p: Place) -> (i32, i32) {
+        let x = (p.0 - self.low.0) * self.scale;
+        let y = self.height - (p.1 - self.low.1) * self.scale;
+        (self.corner.0 + x as i32, self.corner.1 + y as i32)
+    }
+
+    fn holds(&self, p: Place) -> bool {
+        (self.low.0..=self.high.0).contains(&p.0) && (self.low.1..=self.high.1).contains(&p.1)
+    }
+
+    /// The part of a line that is inside.
+    fn line(&self, from: Place, to: Place) -> Option<[(i32, i32); 2]> {
+        let (mut t0, mut t1) = (0.0_f64, 1.0_f64);
+        for (start, delta, low, high) in [
+            (from.0, to.0 - from.0, self.low.0, self.high.0),
+            (from.1, to.1 - from.1, self.low.1, self.high.1),
+        ] {
+            if delta == 0.0 {
+                if start < low || start > high {
+                    return None;
+                }
+                continue;
+            }
+            let (a, b) = ((low - start) / delta, (high - start) / delta);
+            t0 = t0.max(a.min(b));
+            t1 = t1.min(a.max(b));
+        }
+        let at = |t: f64| self.px((from.0 + t * (to.0 - from.0), from.1 + t * (to.1 - from.1)));
+        (t0 <= t1).then(|| [at(t0), at(t1)])
+    }
 }
 
 /// A small arrow in the middle of a line, in the direction of travel.
-fn arrow(line: &[(i32, i32)]) -> Vec<(i32, i32)> {
-    let at = (line.len() - 1) / 2;
-    let ((x0, y0), (x1, y1)) = (line[at], line[at + 1]);
+fn arrow([(x0, y0), (x1, y1)]: &[(i32, i32); 2]) -> Vec<(i32, i32)> {
     let (dx, dy) = (f64::from(x1 - x0), f64::from(y1 - y0));
     let length = dx.hypot(dy).max(1e-9);
     let (ux, uy) = (dx / length, dy / length);

@@ -313,13 +313,13 @@ mod tests {
 
     /// Three zones of two paths each; the controller drives all of zone 0 and one path of zone 2.
     fn run() -> Run {
-        let path = |zone, path| {
+        let named = |zone, path| {
             let flags = if zone == 0 || (zone, path) == (2, 1) { PATH_OWN } else { 0 };
             let length_m = f64::from(100 + 10 * zone + path);
             let spec = PathSpec { zone, path, flags, length_m, ..PathSpec::default() };
             Path { spec, name: format!("z{zone}.a{path}") }
         };
-        let paths: Vec<_> = (0..3).flat_map(|zone| (0..2).map(move |path| path(zone, path))).collect();
+        let paths: Vec<_> = (0..3).flat_map(|zone| (0..2).map(move |path| named(zone, path))).collect();
         let spec = RunSpec { zones: 3, paths: 6, ..RunSpec::default() };
         Run::new(spec, paths, Vec::new(), 1).expect("they come in order")
     }
@@ -361,11 +361,11 @@ mod tests {
         all
     }
 
-    /// Vehicle, length, and partners with their positions.
-    type Seen = (u32, f64, Vec<(u32, f64)>);
+    /// Vehicle, length of its path, and its partners with their positions.
+    type Found = (u32, f64, Vec<(u32, f64)>);
 
     /// What a search through the whole frame finds.
-    fn searched(run: &Run, states: &[VehicleState], all: &[Assignment]) -> Vec<Seen> {
+    fn searched(run: &Run, states: &[VehicleState], all: &[Assignment]) -> Vec<Found> {
         let own = states.iter().filter(|s| s.flags & STATE_LEFT == 0 && run.drives(s.zone, s.path));
         own.map(|s| {
             let its = all.iter().filter(|a| (a.zone, a.vehicle) == (s.zone, s.vehicle));
@@ -379,7 +379,7 @@ mod tests {
         .collect()
     }
 
-    fn seen(run: &Run, states: &[VehicleState], board: &Board) -> Vec<Seen> {
+    fn seen(run: &Run, states: &[VehicleState], board: &Board) -> Vec<Found> {
         let header = FrameHeader::default();
         let step = Step { header: &header, time_s: 0.0, states, run, board };
         let partners = |v: &Vehicle<'_>| v.partners().map(|p| (p.state.vehicle, p.x_m)).collect();
