@@ -13,7 +13,10 @@ use std::sync::Mutex;
 /// Measurements have no place of their own, so one test would clean up what another has laid out.
 static ALONE: Mutex<()> = Mutex::new(());
 
-/// Starts a run that ends by itself only after a long time, and waits until it steps.
+/// At the pace of its clock a run is certainly under way when it is killed.
+const PACED: &[&str] = &["--pace", "realtime"];
+
+/// Starts a run that ends by itself only after a while, and waits until all its parts are there.
 fn start_long(site: &Site, run: &str, more: &[&str]) -> (Process, Vec<(String, u32)>) {
     let supervisor = site.start_in("cz", run, &[&["corridor-8", "--peer-timeout", "60"], more].concat());
     let mut parts = Vec::new();
@@ -61,7 +64,7 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     let site = Site::new("clean");
     let alive = common::unique_name("alive");
     let in_process = site.summary(&["corridor-8", "--in-process"]);
-    let (supervisor, dying) = start_long(&site, site.run(), &[]);
+    let (supervisor, dying) = start_long(&site, site.run(), PACED);
     let (survivor, parts) = start_long(&site, &alive, &["--json", "-"]);
     // It stands still while others are cleared away, so that it is certainly there.
     let has_services = || files(Some(site.runs().parent().unwrap()), &alive).len() > 10;
@@ -130,7 +133,7 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
 fn shared_memory_without_its_directory_is_removed() {
     let _alone = ALONE.lock();
     let site = Site::new("nodir");
-    let (supervisor, parts) = start_long(&site, site.run(), &[]);
+    let (supervisor, parts) = start_long(&site, site.run(), PACED);
     wait_until("the run to have files", || site.files().len() > 10);
     massacre(supervisor, &parts);
     std::fs::remove_dir_all(site.runs()).unwrap();
@@ -147,7 +150,7 @@ fn shared_memory_without_its_directory_is_removed() {
 fn what_a_run_creates_is_private() {
     let _alone = ALONE.lock();
     let site = Site::new("modes");
-    let (supervisor, parts) = start_long(&site, site.run(), &["--wait", "block"]);
+    let (supervisor, parts) = start_long(&site, site.run(), &[PACED, &["--wait", "block"]].concat());
     wait_until("the run to have files", || site.files().len() > 30);
     stop(&supervisor, &parts);
     let found = [site.files(), vec![site.runs()]].concat();
@@ -250,7 +253,7 @@ fn files_cut_short_or_written_over_are_cleaned_away_all_the_same() {
     let _alone = ALONE.lock();
     for (how, bytes) in [("empty", 0), ("short", 5), ("random", 70_000)] {
         let site = Site::new(how);
-        let (supervisor, parts) = start_long(&site, site.run(), &[]);
+        let (supervisor, parts) = start_long(&site, site.run(), PACED);
         wait_until("the run to have files", || site.files().len() > 30);
         massacre(supervisor, &parts);
         let noise: Vec<u8> =
@@ -276,7 +279,7 @@ fn files_cut_short_or_written_over_are_cleaned_away_all_the_same() {
 fn what_a_killed_run_left_is_swept_when_the_next_one_begins() {
     let _alone = ALONE.lock();
     let site = Site::new("sweep");
-    let (supervisor, parts) = start_long(&site, site.run(), &[]);
+    let (supervisor, parts) = start_long(&site, site.run(), PACED);
     wait_until("the run to have files", || site.files().len() > 10);
     massacre(supervisor, &parts);
     assert_ne!(site.files(), Vec::<PathBuf>::new());

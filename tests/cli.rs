@@ -193,7 +193,7 @@ fn json_to_a_file_goes_with_the_table_and_json_to_stdout_alone() {
     assert!(stdout(&short).contains(hash));
 
     let nowhere = directory.path().join("none").join("summary.json");
-    let output = cz(&short).arg("--json").arg(&nowhere).assert().code(1).get_output().clone();
+    let output = cz(&short).arg("--json").arg(&nowhere).assert().code(2).get_output().clone();
     let message = String::from_utf8(output.stderr).unwrap();
     assert!(message.contains("cannot write") && message.contains("summary.json"), "{message}");
 }

@@ -71,7 +71,7 @@ fn a_plug_in_that_fails_after_the_run_takes_nothing_with_it() {
 fn a_plug_in_that_leaves_in_the_middle_is_called_that() {
     let site = Site::new("leaves");
     let command = format!("{} & sleep 0.3; kill $!; exit 0", example("cruise"));
-    let ended = start(&site, &command, &["--set", "end.time_s=36000"]).ended();
+    let ended = start(&site, &command, &["--pace", "realtime"]).ended();
     ended.expect(1, &["controller merge-2 (process ", ") left with code 0 in the middle of the run"]);
     site.assert_clean();
 }

@@ -249,7 +249,7 @@ fn attach_requests_that_contradict_themselves_are_refused_and_end_nothing() {
     let mut parts = [env!("CARGO_BIN_EXE_cz-coord"), env!("CARGO_BIN_EXE_cz-ctrl")].map(start);
     let output = world.wait_with_output().unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
-    assert!(output.status.success() && said.contains("4bd61fbe17f858e7"), "{said}");
+    assert!(output.status.success() && said.contains("b56ea7e351b4a6a2"), "{said}");
     assert!(parts.iter_mut().all(|part| part.wait().unwrap().success()));
 }
 

@@ -12,11 +12,15 @@ use std::sync::Mutex;
 ///
 /// When they differ from what a run gives, something that decides where vehicles drive has changed: the
 /// law, the coordinators, the world, the arrivals, the layout of the state record, or an embedded scenario.
-const GOLDEN: [(&str, [&str; 3]); 4] = [
-    ("two-merges", ["4bd61fbe17f858e7", "33da63d44a5bf155", "9cce8ee0eb8c9bc4"]),
-    ("varying-demand", ["e0a8fbeaddf7c3f7", "3eddbb8299ff70ac", "19983e4ca67be674"]),
-    ("corridor-8", ["d425c59c87e7a4b8", "225fd381739e7d40", "85c790b27f020fd8"]),
-    ("tree", ["6c1acb542981b708", "0ce3fe74a4973a12", "ef6bc45f3bdaf8e8"]),
+const GOLDEN: [(&str, [&str; 3]); 8] = [
+    ("two-merges", ["b56ea7e351b4a6a2", "204eba1f547116eb", "58b2783c8587e258"]),
+    ("varying-demand", ["67d94661f45bbf64", "58778c46844a111e", "640ffabf3c9e3402"]),
+    ("corridor-8", ["f0c18c1290689264", "991904c97437a28f", "5901e5f90c42bf9d"]),
+    ("tree", ["b5580754fa221eb4", "c89773ff58da6ea9", "ee493af4c5cc09b6"]),
+    ("intersection", ["4709c787e0bd4a2d", "b5b69ad2ee3a2846", "21678e1dce4c481c"]),
+    ("roundabout", ["75204c7bf44a0151", "ea76b5293c392892", "35591a6ddc9f9f95"]),
+    ("lane-drop", ["b89e99c310d7b39e", "8ea8d167aff4ca13", "5c231e5a351141b5"]),
+    ("grid-3x3", ["d5ad1398710a0c36", "1db962770d04438f", "d3d0594cbbad19dd"]),
 ];
 
 /// Runs of several processes keep two cores busy: one at a time is faster than two.
@@ -148,4 +152,23 @@ fn the_summary_says_how_the_frames_travelled() {
     assert_eq!((&summary["transport"], &summary["processes"]), (&"in-process".into(), &1.into()));
     let summary = run("two-merges", 1, &["--ctrl-procs", "2", "--coord-procs", "2"]);
     assert_eq!((&summary["transport"], &summary["processes"]), (&"iceoryx2".into(), &5.into()));
+}
+#[test]
+fn intersection() {
+    check("intersection");
+}
+
+#[test]
+fn roundabout() {
+    check("roundabout");
+}
+
+#[test]
+fn lane_drop() {
+    check("lane-drop");
+}
+
+#[test]
+fn grid() {
+    check("grid-3x3");
 }

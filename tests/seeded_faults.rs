@@ -223,7 +223,7 @@ fn faults_of_no_size_change_no_hash() {
         "faults.stalls=[{from_s=1e6}]",
     ];
     let summary = built_in(&scenario("two-merges", 1, &sets));
-    assert_eq!(format!("{:016x}", summary.state_hash), "4bd61fbe17f858e7", "see tests/run_hashes.rs");
+    assert_eq!(format!("{:016x}", summary.state_hash), "b56ea7e351b4a6a2", "see tests/run_hashes.rs");
     let records_noisy = counts(&summary).records_noisy;
     assert_eq!(counts(&summary), FaultCounts { records_noisy, ..biased(&summary) });
     assert_eq!(built_in(&scenario("two-merges", 1, &["faults={}"])).faults, None);

@@ -8,8 +8,7 @@ use std::process::{Command, Stdio};
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use ipc_schemas::{
     Assignment, AttachReply, AttachRequest, CODES, CodeValue, FrameHeader, KindSpec, LAYOUTS, Member,
-    PathSpec, Role,
-    RunSpec, VehicleCommand, VehicleState, ZoneSummary, generate, schema_hash, schema_text,
+    PathSpec, Role, RunSpec, VehicleCommand, VehicleState, ZoneSummary, generate, schema_hash, schema_text,
 };
 
 /// Type name, size, and the fields with their scalar types and offsets.
