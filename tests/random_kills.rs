@@ -176,7 +176,8 @@ fn random_kills(seeds: std::ops::Range<u64>) {
             common::hash(&Site::new("u").summary(&[&[*scenario, "--in-process"], *settings].concat())),
         );
         let start = Instant::now();
-        let run = Site::new("u").start("cz", &[&[*scenario, "--wait", "block"], *settings].concat());
+        let site = Site::new("u");
+        let run = site.start("cz", &[&[*scenario, "--wait", "block"], *settings].concat());
         run.ended_within(VERY_LONG).expect(0, &[]);
         length.push(start.elapsed());
     }

@@ -100,8 +100,16 @@ fn kill_matrix() {
 
 #[test]
 fn a_part_killed_again_and_again_is_replaced_each_time() {
-    let (site, expected) = (Site::new("again"), undisturbed());
-    let (supervisor, _) = begin(&site, &[], 3);
+    // Long enough that the run is not over before the fifth has been replaced.
+    let longer = [
+        "--set",
+        "end.time_s=60000",
+        "--set",
+        "roads.main1.demand.rates=[{until_s=60000.0,vehicles_per_hour=300.0}]",
+    ];
+    let whole = [&LONG_RUN[..], &longer, &["--in-process"]].concat();
+    let (site, expected) = (Site::new("again"), common::hash(&Site::new("u").summary(&whole)));
+    let (supervisor, _) = begin(&site, &longer, 3);
     let mut killed = Vec::new();
     wait_until("five controllers to have been killed", || {
         let parts = children(supervisor.id());

@@ -31,7 +31,7 @@ pub const EQUATIONS: [Mapping; 37] = [
     map(
         "modelF",
         "one zone: passing order, index 0, partners",
-        &[("coordination/partners.rs", "assign"), ("world/role.rs", "Site")],
+        &[("conflict/duties.rs", "derive"), ("world/role.rs", "ZoneState")],
     ),
     map(
         "VehicleDynamics",
@@ -56,7 +56,11 @@ pub const EQUATIONS: [Mapping; 37] = [
     map(
         "VehicleConstraints",
         "limits of acceleration, and of speed as barrier rows",
-        &[("control/rows.rs", "limits"), ("control/law.rs", "rows"), ("scenario/params.rs", "VehicleParams")],
+        &[
+            ("control/rows.rs", "limits"),
+            ("control/ocbf.rs", "rows"),
+            ("scenario/params.rs", "VehicleParams"),
+        ],
     ),
     map("equ:vm", "terminal speed", &[("control/reference.rs", "Terminal")]),
     map("eqn:energyobja", "the weight α", &[("scenario/load/sections.rs", "beta")]),
@@ -70,11 +74,11 @@ pub const EQUATIONS: [Mapping; 37] = [
         "mean objective of a zone: what policies are judged by",
         &[("world/metrics.rs", "ZoneMetrics"), ("reproduce/runs.rs", "total")],
     ),
-    map("fig:diagram", "FE mode, reference, tracking controller", &[("control/law.rs", "decide")]),
+    map("fig:diagram", "FE mode, reference, tracking controller", &[("control/ocbf.rs", "decide")]),
     map("equ:uc_u", "reference acceleration", &[("control/reference.rs", "acceleration_mps2")]),
     map("equ:uc_v", "reference speed", &[("control/reference.rs", "speed_mps")]),
     map("equ:uc_x", "reference position", &[("control/reference.rs", "distance_m")]),
-    map("equ:ucp_vm_1", "entry speed of the reference", &[("control/law.rs", "new_plan")]),
+    map("equ:ucp_vm_1", "entry speed of the reference", &[("control/ocbf.rs", "new_plan")]),
     map("equ:ucp_vm_2", "terminal speed of the reference", &[("control/reference.rs", "coefficients")]),
     map("equ:ucp_vm_4", "terminal position of the reference", &[("control/reference.rs", "coefficients")]),
     map(
@@ -85,10 +89,10 @@ pub const EQUATIONS: [Mapping; 37] = [
     map(
         "equ:cbf",
         "barrier rows",
-        &[("control/law.rs", "rows"), ("vehicle/safety.rs", "row"), ("vehicle/safety.rs", "sampled_row")],
+        &[("control/ocbf.rs", "rows"), ("vehicle/safety.rs", "row"), ("vehicle/safety.rs", "sampled_row")],
     ),
     map("equ:clf", "CLF row", &[("control/qp.rs", "objective"), ("control/clarabel.rs", "solve")]),
-    map("equ:ocbf", "tracking problem over the whole zone, step by step", &[("control/law.rs", "decide")]),
+    map("equ:ocbf", "tracking problem over the whole zone, step by step", &[("control/ocbf.rs", "decide")]),
     map("equ:ocbf_qp", "QP of a step", &[("control/qp.rs", "solve"), ("control/clarabel.rs", "solve")]),
     map(
         "equ:candidate",
@@ -96,7 +100,7 @@ pub const EQUATIONS: [Mapping; 37] = [
         &[
             ("vehicle/safety.rs", "feasibility_row"),
             ("vehicle/safety.rs", "reserve_mps"),
-            ("control/law.rs", "entry_conditions_hold"),
+            ("control/ocbf.rs", "entry_conditions_hold"),
         ],
     ),
     map(
@@ -105,7 +109,7 @@ pub const EQUATIONS: [Mapping; 37] = [
         &[
             ("vehicle/safety.rs", "feasibility_row"),
             ("vehicle/safety.rs", "reserve_mps"),
-            ("control/law.rs", "entry_conditions_hold"),
+            ("control/ocbf.rs", "entry_conditions_hold"),
         ],
     ),
     map(
@@ -119,7 +123,7 @@ pub const EQUATIONS: [Mapping; 37] = [
         &[
             ("coordination/flow.rs", "terminal"),
             ("coordination/summaries.rs", "summarise"),
-            ("control/law.rs", "mean_optimal_terminal_speed_mps"),
+            ("control/ocbf.rs", "mean_optimal_terminal_speed_mps"),
             ("control/reference.rs", "optimal_terminal_speed_mps"),
         ],
     ),
