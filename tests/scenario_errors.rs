@@ -110,7 +110,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "\"dt\\ns\" = 0.1",
-        "s.toml:3: dt\\ns = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
+        "s.toml:3: dt\\ns = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "[control]",
@@ -136,7 +136,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "dts = 0.1",
-        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
+        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "dt_s = 0.1",
@@ -417,7 +417,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "length_m = 200",
         "lenght_m = 200",
-        "s.toml:29: zones.first.approaches.a.lenght_m = 200: unknown key; expected one of name, length_m, road, zone, link_m, link_speed_mps; did you mean length_m?",
+        "s.toml:29: zones.first.approaches.a.lenght_m = 200: unknown key; expected one of name, length_m, road, zone, exit, link_m, link_speed_mps; did you mean length_m?",
     ),
     (
         "link_m = 40",
@@ -586,7 +586,7 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "faults.stalls=[{zones=[\"second\"],paths=[\"second.b\"]}]",
-        "--set faults.stalls=[{zones=[\"second\"],paths=[\"second.b\"]}]: faults.stalls.0.paths = [\"second.b\"]: an approach is named twice; expected each once",
+        "--set faults.stalls=[{zones=[\"second\"],paths=[\"second.b\"]}]: faults.stalls.0.paths = [\"second.b\"]: a path is named twice; expected each once",
     ),
     ("dt_s", "--set dt_s: no '='; expected key=value"),
     ("=1", "--set =1: empty key; expected a dotted key such as end.vehicles"),
@@ -602,11 +602,11 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "dt=0.1",
-        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults; did you mean dt_s?",
+        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "network.size=3",
-        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, roads, zones, controllers, faults",
+        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, shield, fleet, roads, zones, controllers, faults",
     ),
     (
         "control.replan=from_stat",
@@ -737,7 +737,7 @@ fn missing_scenarios_and_seeds() {
     assert_eq!(
         error(load(Some("two-merge"), &[], None)),
         "two-merge: no such scenario; expected one of two-merges, varying-demand, corridor-8, tree, \
-         faulty-sensors, or the path of a TOML file; did you mean two-merges?"
+         faulty-sensors, intersection, roundabout, lane-drop, grid-3x3, or the path of a TOML file; did you mean two-merges?"
     );
     for path in ["nowhere/two-merges", "nowhere.toml"] {
         let message = error(load(Some(path), &[], None));
