@@ -86,9 +86,9 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
             service.is_some()
         });
         let mut outbox = service.unwrap().outbox(8).unwrap();
+        wait_until("the run to be under way", || common::ticks(world.id()) >= 5);
         // A world that waits sleeps, and nobody wakes it for frames that nobody announces.
         let rope = space.bells().unwrap().rope(Role::World, 0);
-        wait_until("the run to be under way", || common::ticks(world.id()) >= 5);
         let mut stopped = false;
         while sent < FRAMES {
             let (header, commands) = forged(sent, RUN_ID, reached_step);

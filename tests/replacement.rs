@@ -114,7 +114,7 @@ fn a_part_killed_again_and_again_is_replaced_each_time() {
     wait_until("five controllers to have been killed", || {
         let parts = children(supervisor.id());
         let controller = parts.iter().find(|(id, line)| {
-            line.get(1).is_some_and(|p| p == "ctrl") && !killed.contains(id) && ticks(*id) >= 2
+            line.get(1).is_some_and(|p| p == "ctrl") && !killed.contains(id) && ticks(*id) >= 8
         });
         if let Some((id, _)) = controller {
             send(*id, Signal::KILL);

@@ -54,7 +54,9 @@ fn check(scenario: &str) {
                 &[],
             ]);
         }
-        for way in ways {
+        // No more processes of a role than zones.
+        let is_possible = |way: &&[&str]| scenario != "intersection" || !way.contains(&"2");
+        for way in ways.into_iter().filter(is_possible) {
             let summary = run(scenario, seed, way);
             check_keys(&summary, scenario, seed);
             assert_eq!(hash(&summary), expected, "{scenario}, seed {seed}, {way:?}");
