@@ -77,6 +77,7 @@ record! {
 
 impl VehicleCommand {
     /// The memory words.
+    #[inline]
     pub fn memory(&self) -> [f64; MEMORY_WORDS] {
         let Self { memory_0, memory_1, memory_2, memory_3, memory_4, memory_5, memory_6, memory_7, .. } =
             *self;
@@ -84,6 +85,7 @@ impl VehicleCommand {
     }
 
     /// The same command with these memory words.
+    #[inline]
     pub fn remembering(self, memory: [f64; MEMORY_WORDS]) -> VehicleCommand {
         let [memory_0, memory_1, memory_2, memory_3, memory_4, memory_5, memory_6, memory_7] = memory;
         VehicleCommand {

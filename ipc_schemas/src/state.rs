@@ -77,11 +77,13 @@ record! {
 
 impl VehicleState {
     /// Whether a controller is to command the vehicle by this record.
+    #[inline]
     pub fn is_commanded(&self) -> bool {
         self.zone != NO_ZONE && self.flags & (STATE_LEFT | STATE_HUMAN) == 0
     }
 
     /// Whether it has left the zone that the record is about.
+    #[inline]
     pub fn has_left(&self) -> bool {
         self.flags & STATE_LEFT != 0
     }

@@ -44,7 +44,7 @@ impl Duty {
 
     /// What is owed where the two are now, if anything still is. Behind a merge the one that passed it first
     /// is the leader; a crossing is over once the vehicle has reached it.
-    #[inline]
+    #[inline(always)]
     pub fn in_force(&self, x_m: f64, partner_x_m: f64) -> Option<DutyKind> {
         if partner_x_m >= self.until_m {
             return None;

@@ -188,7 +188,7 @@ impl Ocbf {
     }
 
     /// The plan in force: made when there is none, re-made when the terminal condition changed.
-    #[inline]
+    #[inline(always)]
     fn plan<'m>(&self, s: &Situation, memory: &'m mut Memory) -> &'m Reference {
         match memory.plan {
             Some(plan) if plan.terminal == s.terminal => {}
@@ -236,7 +236,7 @@ impl Ocbf {
     }
 
     /// Adds all rows but the acceleration limits.
-    #[inline]
+    #[inline(always)]
     fn rows<P, R>(&self, s: &Situation, partners: P, rows: &mut R)
     where
         P: Iterator<Item = Partner>,

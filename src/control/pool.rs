@@ -67,7 +67,7 @@ struct Partners<'a> {
 impl Iterator for Partners<'_> {
     type Item = Partner;
 
-    #[inline]
+    #[inline(always)]
     fn next(&mut self) -> Option<Partner> {
         loop {
             let duty = self.constraints.next()?;
@@ -270,8 +270,10 @@ impl ControllerPool {
             }
             let members = &mut self.members[lane];
             let unassigned = PoolError::Unassigned { zone, present: present.len(), assigned: members.len() };
-            let fits = |(state, member): (&VehicleState, &Member)| state.vehicle == member.vehicle;
-            if present.len() != members.len() || !present.iter().zip(&*members).all(fits) {
+            // No branch per vehicle: that all fit is what one expects.
+            let others =
+                present.iter().zip(&*members).filter(|(state, member)| state.vehicle != member.vehicle);
+            if present.len() != members.len() || others.count() > 0 {
                 return Err(unassigned);
             }
             let (lengths_m, constraints) = (&self.lengths_m[lane], &self.constraints[lane]);
