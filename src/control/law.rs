@@ -1,6 +1,6 @@
 //! What a law is: from one vehicle's situation and partners to its command.
 //!
-//! A law is one file that implements [`Law`], a variant of [`LawKind`](crate::scenario::LawKind), and a line in
+//! A law is one file that implements [`Law`], a variant of [`LawKind`], and a line in
 //! [`Laws`]. It is a pure function of what the frames carry and of what it remembers, and what it remembers travels
 //! in the command frame as words only it understands.
 

@@ -1,6 +1,6 @@
 //! Recordings of runs: every frame of every step in one file, and what can be done with it.
 //!
-//! The writing side takes [`StepFrames`](crate::step::StepFrames) from whoever has seen a step, as one block of bytes that can be made
+//! The writing side takes [`StepFrames`] from whoever has seen a step, as one block of bytes that can be made
 //! in one process and written by another. The reading side trusts nothing: see [`Reader`].
 
 mod block;

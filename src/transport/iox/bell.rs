@@ -150,7 +150,7 @@ impl Bell {
 
 impl BellRope {
     /// Wakes the sleeper, if it sleeps, after something was sent to it. Several ropes are pulled faster by
-    /// [`ring_all`].
+    /// `ring_all`.
     pub fn ring(&self) {
         fence(Ordering::SeqCst);
         self.ring_after_fence();
