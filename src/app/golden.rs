@@ -59,7 +59,7 @@ fn decisions() -> Vec<Value> {
                 conflict_m: 200.0,
                 gap_m: scenario.vehicle.standstill_gap_m,
             });
-            let mut memory = Memory { mode: Mode::Ocbf, plan: None };
+            let mut memory = Memory { mode: Mode::Ocbf, plan: None }.words();
             let decision = law.decide(&s, partner.into_iter(), &mut memory);
             vectors.push(json!({
                 "time": s.time_s, "x": x_m, "v": v_mps, "entry_time": s.entry_time_s,

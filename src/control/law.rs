@@ -91,17 +91,10 @@ impl Words {
 
 /// A control law.
 pub trait Law {
-    /// What it remembers of a vehicle between steps.
-    type Memory: Copy;
-
-    /// What it remembers, from words; of a vehicle that has just entered from [`Words::ENTERED`].
-    fn recall(words: &Words) -> Self::Memory;
-
-    /// The words of what it remembers.
-    fn words(memory: &Self::Memory) -> Words;
-
-    /// Decides one vehicle's command and updates its memory.
-    fn decide<P>(&self, s: &Situation, partners: P, memory: &mut Self::Memory) -> Decision
+    /// Decides one vehicle's command. `memory` is what it left there in the vehicle's last step, or
+    /// [`Words::ENTERED`]; a law that has nothing new to remember writes nothing, for the words are read again at
+    /// once, for the frame.
+    fn decide<P>(&self, s: &Situation, partners: P, memory: &mut Words) -> Decision
     where
         P: Iterator<Item = Partner> + Clone;
 }

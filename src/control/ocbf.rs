@@ -63,11 +63,10 @@ pub struct Ocbf {
 /// Remaining lengths below this are not worth a new plan, m.
 const LEAST_PLAN_M: f64 = 1e-3;
 
-impl Law for Ocbf {
-    type Memory = Memory;
-
+impl Memory {
+    /// From words; anything that is no plan is none.
     #[inline(always)]
-    fn recall(words: &Words) -> Memory {
+    pub fn recall(words: &Words) -> Memory {
         let [start_s, origin_m, v0_mps, a, b, duration_s, terminal_mps, _] = words.words;
         let plan = (duration_s > 0.0).then_some(Reference {
             start_s,
@@ -79,13 +78,13 @@ impl Law for Ocbf {
         Memory { mode: if words.mode == MODE_OCBF { Mode::Ocbf } else { Mode::Fe }, plan }
     }
 
-    #[inline(always)]
-    fn words(memory: &Memory) -> Words {
-        let mode = match memory.mode {
+    /// As words.
+    pub fn words(&self) -> Words {
+        let mode = match self.mode {
             Mode::Fe => MODE_FE,
             Mode::Ocbf => MODE_OCBF,
         };
-        let Some(plan) = &memory.plan else { return Words { mode, ..Words::ENTERED } };
+        let Some(plan) = &self.plan else { return Words { mode, ..Words::ENTERED } };
         let Optimum { a, b, duration_s } = plan.optimum;
         let terminal_mps = match plan.terminal {
             Terminal::Free => -1.0,
@@ -95,18 +94,30 @@ impl Law for Ocbf {
         Words { mode, words }
     }
 
+    /// The plan that is tracked in this step; `None` in FE mode, or when it is to be made first.
+    #[inline(always)]
+    fn plan_for(&self, s: &Situation) -> Option<Reference> {
+        self.plan.filter(|plan| self.mode == Mode::Ocbf && plan.terminal == s.terminal)
+    }
+}
+
+impl Law for Ocbf {
     // In one piece with `program`: handed over in memory, a program is stored field by field and at once
     // loaded two fields at a time, for which the processor waits.
     #[inline(always)]
-    fn decide<P>(&self, s: &Situation, partners: P, memory: &mut Memory) -> Decision
+    fn decide<P>(&self, s: &Situation, partners: P, words: &mut Words) -> Decision
     where
         P: Iterator<Item = Partner> + Clone,
     {
+        let mut memory = Memory::recall(words);
+        if memory.plan_for(s).is_none() {
+            memory = self.renew(s, partners.clone(), memory);
+            *words = memory.words();
+        }
         let vehicle = self.vehicle(s);
-        let brakes = |verdict, exit| Decision { u_mps2: vehicle.u_min_mps2, verdict, exit };
-        let Some(Program { tracking, interval }) = self.program(s, partners.clone(), memory) else {
-            return brakes(Verdict::Fe, memory.exit());
-        };
+        let brakes = |verdict| Decision { u_mps2: vehicle.u_min_mps2, verdict, exit: memory.exit() };
+        let Some(plan) = memory.plan_for(s) else { return brakes(Verdict::Fe) };
+        let Program { tracking, interval } = self.program(s, partners.clone(), &plan);
         let u = match self.control.solver {
             Solver::ClosedForm => qp::solve(&tracking, &interval),
             Solver::Clarabel => {
@@ -116,7 +127,7 @@ impl Law for Ocbf {
             }
         };
         match u {
-            None => brakes(Verdict::Infeasible, memory.exit()),
+            None => brakes(Verdict::Infeasible),
             Some(u) => {
                 let wish = tracking.free_minimum_mps2();
                 let (above, below) = (wish > interval.high, wish < interval.low);
@@ -146,20 +157,33 @@ impl Ocbf {
         &self.kinds[usize::from(s.kind)]
     }
 
-    /// The program of `equ:ocbf_qp` for this step; `None` in FE mode, which does not solve one.
-    #[inline(always)]
-    pub fn program<P>(&self, s: &Situation, partners: P, memory: &mut Memory) -> Option<Program>
+    /// What a vehicle remembers that is still, or just now, in FE mode, or whose terminal condition changed.
+    // Out of line: most vehicles in most steps track the plan they have.
+    #[cold]
+    #[inline(never)]
+    pub fn renew<P>(&self, s: &Situation, partners: P, memory: Memory) -> Memory
     where
-        P: Iterator<Item = Partner> + Clone,
+        P: Iterator<Item = Partner>,
     {
         if memory.mode == Mode::Fe {
             let may_brake = s.x_m <= self.control.fe_fraction * s.length_m;
-            if may_brake && !self.entry_conditions_hold(s, partners.clone()) {
-                return None;
+            if may_brake && !self.entry_conditions_hold(s, partners) {
+                return memory;
             }
-            memory.mode = Mode::Ocbf;
         }
-        let plan = self.plan(s, memory);
+        let plan = match memory.plan {
+            Some(plan) if plan.terminal == s.terminal => plan,
+            old => self.new_plan(s, old),
+        };
+        Memory { mode: Mode::Ocbf, plan: Some(plan) }
+    }
+
+    /// The program of `equ:ocbf_qp` for this step.
+    #[inline(always)]
+    pub fn program<P>(&self, s: &Situation, partners: P, plan: &Reference) -> Program
+    where
+        P: Iterator<Item = Partner>,
+    {
         let (v_ref, u_ref) = plan.at(self.control.position_feedback, s.time_s, s.x_m);
         let tracking = Tracking {
             u_ref_mps2: u_ref,
@@ -170,7 +194,24 @@ impl Ocbf {
         let vehicle = self.vehicle(s);
         let mut interval = Interval::limits(vehicle.u_min_mps2, vehicle.u_max_mps2);
         self.rows(s, partners, &mut interval);
-        Some(Program { tracking, interval })
+        Program { tracking, interval }
+    }
+
+    /// The program this vehicle solves in this step and all its rows; `None` when it is in FE mode.
+    pub fn posed<P>(
+        &self,
+        s: &Situation,
+        partners: P,
+        words: &Words,
+    ) -> Option<(Program, Vec<(Inequality, Row)>)>
+    where
+        P: Iterator<Item = Partner> + Clone,
+    {
+        let memory = Memory::recall(words);
+        let current = memory.plan_for(s).is_some();
+        let memory = if current { memory } else { self.renew(s, partners.clone(), memory) };
+        let plan = memory.plan_for(s)?;
+        Some((self.program(s, partners.clone(), &plan), self.row_list(s, partners)))
     }
 
     /// All rows, one by one, limits included, as a general solver wants them.
@@ -185,16 +226,6 @@ impl Ocbf {
         rows.at_most(Inequality { coefficient: 1.0, bound: vehicle.u_max_mps2 }, Row::UMax);
         self.rows(s, partners, &mut rows);
         rows
-    }
-
-    /// The plan in force: made when there is none, re-made when the terminal condition changed.
-    #[inline(always)]
-    fn plan<'m>(&self, s: &Situation, memory: &'m mut Memory) -> &'m Reference {
-        match memory.plan {
-            Some(plan) if plan.terminal == s.terminal => {}
-            old => memory.plan = Some(self.new_plan(s, old)),
-        }
-        memory.plan.as_ref().expect("there was a plan, or one has just been made")
     }
 
     /// Plans from the entry or from the present state (`replan` in the scenario).

@@ -236,9 +236,8 @@ impl ControllerPool {
     ) -> Result<(), PoolError> {
         self.visit(time_s, states, |laws, mut scene| match laws {
             Laws::Ocbf(law) => scene.each(|_, situation, partners, member| {
-                let mut memory = super::Ocbf::recall(&member.memory);
-                if let Some(program) = law.program(situation, partners.clone(), &mut memory) {
-                    show(&program, law.row_list(situation, partners));
+                if let Some((program, rows)) = law.posed(situation, partners, &member.memory) {
+                    show(&program, rows);
                 }
             }),
         })
@@ -290,8 +289,17 @@ impl ControllerPool {
     }
 
     fn own_range(&self, states: &[VehicleState]) -> Range<usize> {
-        let from = states.partition_point(|s| s.zone < self.zones.start);
-        from..from + states[from..].partition_point(|s| s.zone < self.zones.end)
+        // One pool mostly has all zones, and of several the first and the last begin or end with the frame. A search
+        // takes as long as a vehicle or two.
+        let from = match states.first() {
+            Some(first) if first.zone >= self.zones.start => 0,
+            _ => states.partition_point(|s| s.zone < self.zones.start),
+        };
+        let to = match states.last() {
+            Some(last) if last.zone < self.zones.end => states.len(),
+            _ => from + states[from..].partition_point(|s| s.zone < self.zones.end),
+        };
+        from..to.max(from)
     }
 
     fn own<'a>(&self, states: &'a [VehicleState]) -> &'a [VehicleState] {
@@ -317,9 +325,7 @@ impl Scene<'_> {
     #[inline(always)]
     fn decide<L: Law>(mut self, law: &L, emit: &mut impl FnMut(VehicleCommand)) {
         self.each(|state, situation, partners, member| {
-            let mut memory = L::recall(&member.memory);
-            let decision = law.decide(situation, partners, &mut memory);
-            member.memory = L::words(&memory);
+            let decision = law.decide(situation, partners, &mut member.memory);
             emit(command(state, &decision, &member.memory));
         });
     }

@@ -9,7 +9,7 @@ use super::ReproduceError;
 use super::grid::{Entry, Grid, number};
 use crate::conflict::DutyKind;
 use crate::control::reference::Problem;
-use crate::control::{Law, Memory, Ocbf, Partner, Situation, Terminal};
+use crate::control::{Law, Ocbf, Partner, Situation, Terminal, Words};
 use crate::scenario::{self, ReferenceLaw, Scenario};
 use crate::vehicle::Held;
 use clarabel::algebra::CscMatrix;
@@ -239,7 +239,7 @@ impl Rows {
 /// Duration and cost of the built-in law behind the leader.
 fn drive(scenario: &Scenario, problem: &Problem, leader: Option<Leader>) -> (f64, f64) {
     let law = Ocbf::new(scenario);
-    let (dt_s, mut memory) = (scenario.dt_s(), Memory::ENTERED);
+    let (dt_s, mut memory) = (scenario.dt_s(), Words::ENTERED);
     let (mut time_s, mut x_m, mut v_mps, mut energy) = (0.0, 0.0, problem.v0_mps, 0.0);
     loop {
         let situation = Situation {

@@ -35,7 +35,7 @@ fn chase(scenario: &Scenario, v: f64, gap: f64, leader_v: f64, leader_us: &[f64]
     let entry = v;
     // The leader has cruised until now.
     let mut p = ahead(gap, leader_v, 0.0);
-    let mut memory = OCBF;
+    let mut memory = OCBF.words();
     let mut seen = Chase {
         least_margin_m: f64::INFINITY,
         worst_gap_mps2: f64::NEG_INFINITY,

@@ -97,7 +97,10 @@ fn merging(x_m: f64, v_mps: f64, u_mps2: f64) -> Partner {
 const OCBF: Memory = Memory { mode: Mode::Ocbf, plan: None };
 
 fn decide(scenario: &Scenario, s: &Situation, partners: &[Partner], memory: &mut Memory) -> Decision {
-    Ocbf::new(scenario).decide(s, partners.iter().copied(), memory)
+    let mut words = memory.words();
+    let decision = Ocbf::new(scenario).decide(s, partners.iter().copied(), &mut words);
+    *memory = Memory::recall(&words);
+    decision
 }
 
 /// The decision of a vehicle that has left FE mode but has no plan yet.
