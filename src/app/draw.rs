@@ -2,6 +2,7 @@
 
 use super::AppError;
 use crate::conflict::{Conflicts, PointKind};
+use crate::scenario::shapes::{Place, Shapes};
 use crate::scenario::{Network, Scenario, Source, ZoneId};
 use plotters::coord::Shift;
 use plotters::prelude::*;
@@ -9,14 +10,10 @@ use plotters::style::register_font;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 use std::path::Path;
 
-type Place = (f64, f64);
-
 /// Longer side of the picture, pixels.
 const SIZE_PX: f64 = 1400.0;
 /// Room around it, pixels.
 const MARGIN_PX: f64 = 60.0;
-/// How far apart lanes are drawn that have no shape, m.
-const APART_M: f64 = 40.0;
 const LANE: RGBColor = RGBColor(120, 120, 120);
 const ENTRANCE: RGBColor = RGBColor(44, 120, 60);
 const EXIT: RGBColor = RGBColor(31, 80, 160);
@@ -56,10 +53,11 @@ struct Picture {
 
 impl Picture {
     fn of(network: &Network) -> Picture {
-        let shapes = layout(network);
+        let shapes = Shapes::of(network);
         let mut picture = Picture::default();
-        for (index, zone) in network.zones.iter().enumerate() {
-            for (segment, shape) in zone.segments.iter().zip(&shapes[index]) {
+        for (id, zone) in (0..).zip(&network.zones) {
+            let lanes = shapes.segments(id);
+            for (segment, shape) in zone.segments.iter().zip(lanes) {
                 let color = if segment.source.is_some() { ENTRANCE } else { LANE };
                 picture.lanes.push((shape.clone(), color));
                 if let Some(Source::Road(road)) = segment.source {
@@ -67,41 +65,26 @@ impl Picture {
                 }
             }
             for (at, exit) in (0..).zip(&zone.exits) {
-                let mut ends = zone.paths.iter().filter(|path| path.exit == at);
-                let last = ends.next().and_then(|path| path.segments.last()).expect("an exit ends some path");
-                let shape = &shapes[index][*last as usize];
-                let end = shape[shape.len() - 1];
-                match exit.to {
-                    None => picture.labels.push((end, exit.name.clone(), EXIT)),
-                    Some(to) => picture.links.push([end, shapes[to.zone as usize][to.segment as usize][0]]),
+                match shapes.link(network, id, at) {
+                    Some(link) => picture.links.push(link),
+                    None => picture.labels.push((shapes.exit(network, id, at), exit.name.clone(), EXIT)),
                 }
             }
-            picture.add_points(network, index as ZoneId, &shapes[index]);
-            let all: Vec<Place> = shapes[index].iter().flatten().copied().collect();
+            picture.add_points(network, id, &shapes);
+            let all: Vec<Place> = lanes.iter().flatten().copied().collect();
             let mean = |of: fn(&Place) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
             picture.labels.push(((mean(|p| p.0), mean(|p| p.1)), zone.name.clone(), BLACK));
         }
         picture
     }
 
-    /// The conflict points of a zone, each where the first path that uses it passes it.
-    fn add_points(&mut self, network: &Network, zone: ZoneId, shapes: &[Vec<Place>]) {
+    /// The conflict points of a zone.
+    fn add_points(&mut self, network: &Network, zone: ZoneId, shapes: &Shapes) {
         let conflicts = Conflicts::of(network, zone);
-        let shape = &network.zones[zone as usize];
         for (at, point) in (0..).zip(conflicts.points()) {
-            let used = (0..shape.paths.len() as u32)
-                .find_map(|path| Some((path, conflicts.uses(path).iter().find(|u| u.point == at)?.at_m)));
-            let Some((path, mut left_m)) = used else { continue };
-            for &segment in &shape.paths[path as usize].segments {
-                let length_m = shape.segments[segment as usize].length_m;
-                let is_last = shape.paths[path as usize].segments.last() == Some(&segment);
-                if left_m <= length_m || is_last {
-                    let place = along(&shapes[segment as usize], left_m / length_m);
-                    self.points.push((place, point.kind, point.name.clone()));
-                    break;
-                }
-                left_m -= length_m;
-            }
+            let Some((path, at_m)) = conflicts.first_use(at) else { continue };
+            let place = shapes.on_path(network, zone, path, at_m);
+            self.points.push((place, point.kind, point.name.clone()));
         }
     }
 
@@ -266,68 +249,4 @@ fn arrow([(x0, y0), (x1, y1)]: &[(i32, i32); 2]) -> Vec<(i32, i32)> {
     } else {
         vec![place(7.0, 0.0), place(-5.0, 5.0), place(-5.0, -5.0)]
     }
-}
-
-/// The place at a share of a polyline's length.
-fn along(shape: &[Place], share: f64) -> Place {
-    let lengths: Vec<f64> = shape.windows(2).map(|w| (w[1].0 - w[0].0).hypot(w[1].1 - w[0].1)).collect();
-    let mut left = share.clamp(0.0, 1.0) * lengths.iter().sum::<f64>();
-    for (pair, length) in shape.windows(2).zip(&lengths) {
-        if left <= *length && *length > 0.0 {
-            let t = left / length;
-            return (pair[0].0 + t * (pair[1].0 - pair[0].0), pair[0].1 + t * (pair[1].1 - pair[0].1));
-        }
-        left -= length;
-    }
-    shape[shape.len() - 1]
-}
-
-/// A polyline of every segment of every zone: its shape, or else lanes from left to right, zones one behind the other
-/// and side by side where they do not lie on one way.
-fn layout(network: &Network) -> Vec<Vec<Vec<Place>>> {
-    let mut shapes: Vec<Vec<Vec<Place>>> = Vec::with_capacity(network.zones.len());
-    let mut free_m = 0.0;
-    for zone in &network.zones {
-        // Behind the zone upstream that is placed already; otherwise a row of its own.
-        let upstream = zone.segments.iter().enumerate().find_map(|(at, segment)| match segment.source {
-            Some(Source::Zone { zone, exit }) if (zone as usize) < shapes.len() => {
-                let there = &network.zones[zone as usize];
-                let path = there.paths.iter().find(|path| path.exit == exit)?;
-                let shape = &shapes[zone as usize][*path.segments.last()? as usize];
-                let link_m = there.exits[exit as usize].to.map_or(0.0, |to| to.link_m);
-                let end = shape[shape.len() - 1];
-                Some((at, (end.0 + link_m, end.1)))
-            }
-            _ => None,
-        });
-        let entrances: Vec<usize> =
-            (0..zone.segments.len()).filter(|&s| zone.segments[s].source.is_some()).collect();
-        let (first, origin) = upstream.unwrap_or((entrances[0], (0.0, free_m)));
-        if upstream.is_none() && zone.segments.iter().all(|s| s.shape.is_empty()) {
-            free_m -= APART_M * (entrances.len() as f64 + 1.0);
-        }
-        let longest_m = zone.longest_m();
-        let mut placed: Vec<Vec<Place>> = Vec::with_capacity(zone.segments.len());
-        for (at, segment) in zone.segments.iter().enumerate() {
-            if !segment.shape.is_empty() {
-                placed.push(segment.shape.iter().map(|&[x, y]| (x, y)).collect());
-                continue;
-            }
-            let path = zone
-                .paths
-                .iter()
-                .find(|p| p.segments.contains(&(at as u32)))
-                .expect("a path uses each segment");
-            let before = path.segments.iter().take_while(|&&s| s as usize != at);
-            let from_m: f64 =
-                before.map(|&s| zone.segments[s as usize].length_m).sum::<f64>() + longest_m - path.length_m;
-            let row = entrances.iter().position(|&e| e == at).unwrap_or(0) as f64;
-            let first_row = entrances.iter().position(|&e| e == first).unwrap_or(0) as f64;
-            let aside_m = if segment.source.is_some() { (row - first_row) * -APART_M } else { 0.0 };
-            let start = (origin.0 + from_m, origin.1 + aside_m);
-            placed.push(vec![start, (origin.0 + from_m + segment.length_m, origin.1)]);
-        }
-        shapes.push(placed);
-    }
-    shapes
 }

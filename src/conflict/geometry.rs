@@ -125,6 +125,13 @@ impl Conflicts {
         &self.paths[path as usize].uses
     }
 
+    /// The first path that passes a conflict point, and where on it, m.
+    pub fn first_use(&self, point: u32) -> Option<(u32, f64)> {
+        (0..).zip(&self.paths).find_map(|(path, own)| {
+            own.uses.iter().find(|u| u.point == point).map(|u| (path, u.at_m))
+        })
+    }
+
     /// Length of a path, m.
     pub fn length_m(&self, path: u32) -> f64 {
         self.paths[path as usize].length_m

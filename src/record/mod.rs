@@ -12,6 +12,7 @@ mod recorder;
 mod replay;
 #[cfg(fuzzing)]
 mod reseal;
+pub mod words;
 mod writer;
 
 pub use crate::step::{CommandPart, Commands, Step, StepFrames};

@@ -16,6 +16,7 @@ pub mod network;
 pub mod params;
 pub mod plugins;
 mod ranges;
+pub mod shapes;
 pub mod share;
 
 pub use arrivals::ArrivalStream;
