@@ -29,6 +29,7 @@ use crate::scenario::ScenarioError;
 use crate::scenario::load::printable;
 use crate::transport::iox::SpaceError;
 use clap::Parser;
+pub use record::open as open_recording;
 use std::process::ExitCode;
 
 /// Why a command did not succeed; decides the exit code.
@@ -154,6 +155,14 @@ pub fn cz_ctrl() -> ExitCode {
     finish("cz-ctrl", parts::controller(&args::Standalone::<args::PartArgs>::parse().args))
 }
 
+/// A program of this project that is not one of the four: says panics and errors in one line, and ends with the exit
+/// code they have everywhere.
+pub fn program(name: &'static str, main: impl FnOnce() -> Result<(), AppError>) -> ExitCode {
+    say_panics_in_a_line(name);
+    raise_file_limit();
+    finish(name, main())
+}
+
 /// Lets this process open as many files as it may: a run with many processes needs more than the usual first bound.
 fn raise_file_limit() {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -184,7 +193,7 @@ impl AppError {
 }
 
 /// Writes to stdout; a reader that has gone away is no reason to panic.
-fn print(text: &str) -> Result<(), AppError> {
+pub fn print(text: &str) -> Result<(), AppError> {
     use std::io::{ErrorKind, Write};
     let mut out = std::io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {

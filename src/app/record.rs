@@ -175,7 +175,7 @@ fn is_same_file(a: &Path, b: &Path) -> bool {
 }
 
 /// A recording, or why it cannot be read. When another build has written it, that is said.
-pub(super) fn open(path: &Path) -> Result<Reader<FileSource>, AppError> {
+pub fn open(path: &Path) -> Result<Reader<FileSource>, AppError> {
     let reader =
         Reader::open(path).map_err(|error| AppError::Usage(format!("{}: {error}", path.display())))?;
     let (writer, own) = (&reader.metadata().build, Build::own());

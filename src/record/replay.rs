@@ -209,7 +209,9 @@ impl Tally {
     }
 }
 
-struct WorldReplay {
+/// The world of a recording, brought on step by step by the recorded commands.
+#[derive(Debug)]
+pub struct WorldReplay {
     world: World,
     /// With all frames that came out right in it.
     state_hash: u64,
@@ -219,15 +221,26 @@ struct WorldReplay {
 }
 
 impl WorldReplay {
-    fn new<S: Source>(reader: &Reader<S>) -> WorldReplay {
+    /// The world before its first step.
+    pub fn new<S: Source>(reader: &Reader<S>) -> WorldReplay {
         let metadata = reader.metadata();
         let mut world = World::new(reader.scenario().clone(), metadata.coordinators);
         world.share_out(metadata.controllers);
         WorldReplay { world, state_hash: 0, finished: false, missed: false }
     }
 
+    /// The world: where the next step finds it, or where the last step of the run left it.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+
+    /// Has the world keep every visit from now on.
+    pub fn record_visits(&mut self) {
+        self.world.record_visits();
+    }
+
     /// Compares the world with the recorded state, then gives it the recorded commands.
-    fn take(&mut self, step: &Step) -> Result<(), ReplayError> {
+    pub fn take(&mut self, step: &Step) -> Result<(), ReplayError> {
         let world = &mut self.world;
         let masks = world.coordinator_masks();
         let finished = world.is_finished();

@@ -11,6 +11,7 @@ pub(crate) mod draw;
 mod embedded;
 pub mod encode;
 pub mod faults;
+pub mod layout;
 pub mod load;
 pub mod network;
 pub mod params;
