@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0x7e50f4f5fb4edbd2)
+#define CZ_SCHEMA_HASH UINT64_C(0x2291d52fc5522958)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -191,7 +191,7 @@
 /* Names under which the transport registers the record types. */
 #define CZ_TYPE_NAME_FRAME_HEADER "cz.FrameHeader.v1"
 #define CZ_TYPE_NAME_VEHICLE_STATE "cz.VehicleState.v2"
-#define CZ_TYPE_NAME_ASSIGNMENT "cz.Assignment.v2"
+#define CZ_TYPE_NAME_ASSIGNMENT "cz.Assignment.v3"
 #define CZ_TYPE_NAME_ZONE_SUMMARY "cz.ZoneSummary.v1"
 #define CZ_TYPE_NAME_VEHICLE_COMMAND "cz.VehicleCommand.v2"
 #define CZ_TYPE_NAME_MEMBER "cz.Member.v1"
@@ -334,6 +334,13 @@ typedef struct cz_assignment {
     double until_m;
     /** Terminal speed v_m the vehicle is to leave the zone with, m/s. */
     double terminal_speed_mps;
+    /** Place on the vehicle's path that its coordinator has scheduled it for, m: normally its last
+     *  conflict point or its path's end. Like the terminal speed the same in all records of a
+     *  vehicle. */
+    double scheduled_at_m;
+    /** Instant at which it is to be there, and before which it is not, s since the start of the
+     *  run; 0 when nothing is scheduled. */
+    double scheduled_time_s;
     /** The vehicle bound by this record. */
     uint32_t vehicle;
     /** The vehicle it yields to, or `CZ_NO_VEHICLE`. */
@@ -349,20 +356,22 @@ typedef struct cz_assignment {
     /** Bit 0: the terminal speed is free. */
     uint16_t flags;
 } cz_assignment_t;
-CZ_ASSERT_(assignment_size, sizeof(cz_assignment_t) == 64);
+CZ_ASSERT_(assignment_size, sizeof(cz_assignment_t) == 80);
 CZ_ASSERT_ALIGN_(cz_assignment_t, 8);
 CZ_ASSERT_(assignment_own_conflict_m_offset, offsetof(cz_assignment_t, own_conflict_m) == 0);
 CZ_ASSERT_(assignment_partner_conflict_m_offset, offsetof(cz_assignment_t, partner_conflict_m) == 8);
 CZ_ASSERT_(assignment_gap_m_offset, offsetof(cz_assignment_t, gap_m) == 16);
 CZ_ASSERT_(assignment_until_m_offset, offsetof(cz_assignment_t, until_m) == 24);
 CZ_ASSERT_(assignment_terminal_speed_mps_offset, offsetof(cz_assignment_t, terminal_speed_mps) == 32);
-CZ_ASSERT_(assignment_vehicle_offset, offsetof(cz_assignment_t, vehicle) == 40);
-CZ_ASSERT_(assignment_partner_offset, offsetof(cz_assignment_t, partner) == 44);
-CZ_ASSERT_(assignment_zone_offset, offsetof(cz_assignment_t, zone) == 48);
-CZ_ASSERT_(assignment_point_offset, offsetof(cz_assignment_t, point) == 52);
-CZ_ASSERT_(assignment_rank_offset, offsetof(cz_assignment_t, rank) == 56);
-CZ_ASSERT_(assignment_kind_offset, offsetof(cz_assignment_t, kind) == 60);
-CZ_ASSERT_(assignment_flags_offset, offsetof(cz_assignment_t, flags) == 62);
+CZ_ASSERT_(assignment_scheduled_at_m_offset, offsetof(cz_assignment_t, scheduled_at_m) == 40);
+CZ_ASSERT_(assignment_scheduled_time_s_offset, offsetof(cz_assignment_t, scheduled_time_s) == 48);
+CZ_ASSERT_(assignment_vehicle_offset, offsetof(cz_assignment_t, vehicle) == 56);
+CZ_ASSERT_(assignment_partner_offset, offsetof(cz_assignment_t, partner) == 60);
+CZ_ASSERT_(assignment_zone_offset, offsetof(cz_assignment_t, zone) == 64);
+CZ_ASSERT_(assignment_point_offset, offsetof(cz_assignment_t, point) == 68);
+CZ_ASSERT_(assignment_rank_offset, offsetof(cz_assignment_t, rank) == 72);
+CZ_ASSERT_(assignment_kind_offset, offsetof(cz_assignment_t, kind) == 76);
+CZ_ASSERT_(assignment_flags_offset, offsetof(cz_assignment_t, flags) == 78);
 
 /** A zone's traffic, told to one neighbour at the zone's own events.
  *

@@ -30,7 +30,7 @@ record! {
     /// before it; members come in the order of the state frame. Between events the positions of the two decide what is
     /// in force: nothing once the partner is at `until_m`; toward a merging partner what is owed to a leader once the
     /// vehicle has passed the point; toward a crossing one nothing from then on.
-    #[type_name("cz.Assignment.v2")]
+    #[type_name("cz.Assignment.v3")]
     pub struct Assignment {
         /// Distance of the conflict point from the zone's origin on the vehicle's path, m. Toward a leader, of a
         /// place that both pass: what counts is the difference to the next field.
@@ -44,6 +44,12 @@ record! {
         pub until_m: f64,
         /// Terminal speed v_m the vehicle is to leave the zone with, m/s.
         pub terminal_speed_mps: f64,
+        /// Place on the vehicle's path that its coordinator has scheduled it for, m: normally its last conflict point or
+        /// its path's end. Like the terminal speed the same in all records of a vehicle.
+        pub scheduled_at_m: f64,
+        /// Instant at which it is to be there, and before which it is not, s since the start of the run; 0 when nothing
+        /// is scheduled.
+        pub scheduled_time_s: f64,
         /// The vehicle bound by this record.
         pub vehicle: u32,
         /// The vehicle it yields to, or `NO_VEHICLE`.

@@ -58,21 +58,23 @@ const GOLDEN: [Golden; 11] = [
         ],
     ),
     (
-        "cz.Assignment.v2",
-        64,
+        "cz.Assignment.v3",
+        80,
         &[
             ("own_conflict_m", "f64", 0),
             ("partner_conflict_m", "f64", 8),
             ("gap_m", "f64", 16),
             ("until_m", "f64", 24),
             ("terminal_speed_mps", "f64", 32),
-            ("vehicle", "u32", 40),
-            ("partner", "u32", 44),
-            ("zone", "u32", 48),
-            ("point", "u32", 52),
-            ("rank", "u32", 56),
-            ("kind", "u16", 60),
-            ("flags", "u16", 62),
+            ("scheduled_at_m", "f64", 40),
+            ("scheduled_time_s", "f64", 48),
+            ("vehicle", "u32", 56),
+            ("partner", "u32", 60),
+            ("zone", "u32", 64),
+            ("point", "u32", 68),
+            ("rank", "u32", 72),
+            ("kind", "u16", 76),
+            ("flags", "u16", 78),
         ],
     ),
     (
@@ -208,7 +210,7 @@ const GOLDEN: [Golden; 11] = [
 ];
 
 /// XXH3-64 of the schema text of [`GOLDEN`].
-const GOLDEN_HASH: u64 = 0x7e50_f4f5_fb4e_dbd2;
+const GOLDEN_HASH: u64 = 0x2291_d52f_c552_2958;
 
 fn crate_dir() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

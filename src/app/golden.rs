@@ -49,15 +49,13 @@ fn decisions() -> Vec<Value> {
                 entry_speed_mps: 16.0,
                 length_m: 200.0,
                 terminal: Terminal::Speed(18.5),
+                schedule: None,
                 kind: 0,
             };
             let partner = partner.map(|(kind, gap)| Partner {
-                kind,
-                x_m: x_m + gap,
-                v_mps: 15.5,
-                u_mps2: -0.5,
                 conflict_m: 200.0,
                 gap_m: scenario.vehicle.standstill_gap_m,
+                ..Partner::unplanned(kind, x_m + gap, 15.5, -0.5)
             });
             let mut memory = Memory { mode: Mode::Ocbf, plan: None }.words();
             let decision = law.decide(&s, partner.into_iter(), &mut memory);

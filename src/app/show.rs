@@ -401,13 +401,19 @@ fn state_table(scenario: &Scenario, states: &[VehicleState]) -> String {
 }
 
 fn assignment_table(scenario: &Scenario, assignments: &[Assignment]) -> String {
-    let mut table = new_table(&["vehicle", "zone", "yields to", "terminal speed\n[m/s]"]);
+    let header = ["vehicle", "zone", "yields to", "terminal speed\n[m/s]", "scheduled"];
+    let mut table = new_table(&header);
     for a in assignments {
         let partner = match a.kind {
             frames::CONSTRAINT_NONE => "nobody".to_owned(),
             frames::CONSTRAINT_REAR_END => format!("{} ahead", a.partner),
             frames::CONSTRAINT_MERGE => format!("{} at the merging point", a.partner),
+            frames::CONSTRAINT_CROSS => format!("{} at the crossing", a.partner),
             other => format!("{} (kind {other})", a.partner),
+        };
+        let scheduled = match a.scheduled_time_s > 0.0 {
+            true => format!("{:.2} m at {:.3} s", a.scheduled_at_m, a.scheduled_time_s),
+            false => "–".to_owned(),
         };
         let free = a.flags & frames::ASSIGNMENT_FREE_TERMINAL != 0;
         table.add_row([
@@ -415,6 +421,7 @@ fn assignment_table(scenario: &Scenario, assignments: &[Assignment]) -> String {
             zone_name(scenario, a.zone),
             partner,
             if free { "free".to_owned() } else { format!("{:.3}", a.terminal_speed_mps) },
+            scheduled,
         ]);
     }
     right(&mut table, &[0, 3]);

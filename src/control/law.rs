@@ -28,6 +28,44 @@ pub struct Partner {
     pub conflict_m: f64,
     /// Distance delta to be kept to it, m.
     pub gap_m: f64,
+    /// Its position, likewise, from which on nothing is owed to it, m; infinite while the two drive on together.
+    pub until_m: f64,
+    /// Its kind: index in the scenario's fleet.
+    pub vehicle_kind: u16,
+    /// The end of its own path in the vehicle's own coordinate, m: where it is then, or has been.
+    pub exit_at_m: f64,
+    /// Its broadcast intent: instant at which it plans to be there, s; 0 without a plan, past once it has left.
+    pub exit_time_s: f64,
+    /// Its broadcast intent: speed at that instant, m/s.
+    pub exit_speed_mps: f64,
+}
+
+impl Partner {
+    /// A partner of the first kind that has broadcast no plan, to be completed with where it meets the vehicle.
+    pub const fn unplanned(kind: DutyKind, x_m: f64, v_mps: f64, u_mps2: f64) -> Partner {
+        Partner {
+            kind,
+            x_m,
+            v_mps,
+            u_mps2,
+            conflict_m: 0.0,
+            gap_m: 0.0,
+            until_m: f64::INFINITY,
+            vehicle_kind: 0,
+            exit_at_m: f64::INFINITY,
+            exit_time_s: 0.0,
+            exit_speed_mps: 0.0,
+        }
+    }
+}
+
+/// What a coordinator has scheduled a vehicle for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Schedule {
+    /// Place on the vehicle's path, m.
+    pub at_m: f64,
+    /// Instant at which it is to be there, and before which it is not, s.
+    pub time_s: f64,
 }
 
 /// A vehicle at the start of a step.
@@ -47,6 +85,8 @@ pub struct Situation {
     pub length_m: f64,
     /// Terminal condition in force.
     pub terminal: Terminal,
+    /// What its coordinator has scheduled it for, if anything.
+    pub schedule: Option<Schedule>,
     /// Kind of vehicle: index in the scenario's fleet.
     pub kind: u16,
 }

@@ -10,7 +10,7 @@ pub mod qp;
 pub mod reference;
 pub mod rows;
 
-pub use law::{Decision, Law, Laws, Partner, Situation, Verdict, Words};
+pub use law::{Decision, Law, Laws, Partner, Schedule, Situation, Verdict, Words};
 pub use ocbf::{Memory, Mode, Ocbf};
 pub use pool::ControllerPool;
 pub use reference::{Optimum, Reference, Terminal};

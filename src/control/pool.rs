@@ -1,6 +1,6 @@
 //! The controller role: the vehicles of some zones, from state and coordination frames to commands.
 
-use super::law::{Decision, Law, Laws, Partner, Situation, Verdict, Words};
+use super::law::{Decision, Law, Laws, Partner, Schedule, Situation, Verdict, Words};
 use super::ocbf::Program;
 use super::reference::Terminal;
 use super::rows::Row;
@@ -27,6 +27,9 @@ pub struct ControllerPool {
     members: Lanes<Member>,
     /// Their constraints.
     constraints: Lanes<Duty>,
+    /// What they are scheduled for, aligned with the members; empty where nobody is, as always under coordinators that
+    /// do not schedule.
+    schedules: Lanes<Option<Schedule>>,
     /// Where each zone's slice began in the last frame: about where it begins in the next.
     starts: Vec<usize>,
     /// A zone's new members and constraints while they are put together; kept for their allocations.
@@ -40,6 +43,7 @@ pub struct ControllerPool {
 struct Renewed {
     members: Vec<Member>,
     constraints: Vec<Duty>,
+    schedules: Vec<Option<Schedule>>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -61,6 +65,7 @@ const RECORDS_AHEAD: usize = 24;
 struct Partners<'a> {
     constraints: std::slice::Iter<'a, Duty>,
     slice: &'a [VehicleState],
+    lengths_m: &'a [f64],
     x_m: f64,
 }
 
@@ -73,6 +78,8 @@ impl Iterator for Partners<'_> {
             let duty = self.constraints.next()?;
             let partner = &self.slice[duty.partner as usize];
             let Some(kind) = duty.in_force(self.x_m, partner.x_m) else { continue };
+            // Laws that do not look at exits pay nothing for them: no index that could be out of bounds.
+            let length_m = self.lengths_m.get(partner.path as usize).copied().unwrap_or(f64::INFINITY);
             return Some(Partner {
                 kind,
                 x_m: partner.x_m + duty.shift_m(),
@@ -80,6 +87,11 @@ impl Iterator for Partners<'_> {
                 u_mps2: partner.u_mps2,
                 conflict_m: duty.own_m,
                 gap_m: duty.gap_m,
+                until_m: duty.until_m + duty.shift_m(),
+                vehicle_kind: partner.kind,
+                exit_at_m: length_m + duty.shift_m(),
+                exit_time_s: partner.planned_exit_time_s,
+                exit_speed_mps: partner.planned_exit_speed_mps,
             });
         }
     }
@@ -106,8 +118,8 @@ pub enum PoolError {
         /// The vehicle.
         vehicle: u32,
     },
-    /// An assignment has a kind no constraint has, distances that are not positive numbers, or a terminal
-    /// speed no vehicle may have.
+    /// An assignment has a kind no constraint has, distances that are not positive numbers, a terminal
+    /// speed no vehicle may have, or an instant that is none.
     #[error("an assignment of vehicle {vehicle} in zone {zone} is malformed")]
     Malformed {
         /// The zone.
@@ -145,6 +157,7 @@ impl ControllerPool {
             lengths_m,
             members: Lanes::new(count),
             constraints: Lanes::new(count),
+            schedules: Lanes::new(count),
             starts: vec![0; count],
             renewed: Renewed::default(),
             plugged: plugged.filter(|(zone, _)| zones.contains(zone)).collect(),
@@ -177,6 +190,7 @@ impl ControllerPool {
                 self.renewed.assign(zone, slice, group, &self.members[lane], self.v_max_mps)?;
                 self.members.set(lane, &self.renewed.members);
                 self.constraints.set(lane, &self.renewed.constraints);
+                self.schedules.set(lane, &self.renewed.schedules);
             }
         }
         Ok(())
@@ -197,6 +211,7 @@ impl ControllerPool {
         for lane in 0..self.zones.len() {
             self.members.set(lane, &[]);
             self.constraints.set(lane, &[]);
+            self.schedules.set(lane, &[]);
         }
         for group in commands.chunk_by(|a, b| a.zone == b.zone) {
             if self.zones.contains(&group[0].zone) {
@@ -275,9 +290,17 @@ impl ControllerPool {
             if present.len() != members.len() || others.count() > 0 {
                 return Err(unassigned);
             }
-            let (lengths_m, constraints) = (&self.lengths_m[lane], &self.constraints[lane]);
-            let (plugged, kinds) = (&self.plugged, self.kinds);
-            let scene = Scene { time_s, slice, present, members, lengths_m, constraints, plugged, kinds };
+            let scene = Scene {
+                time_s,
+                slice,
+                present,
+                members,
+                lengths_m: &self.lengths_m[lane],
+                constraints: &self.constraints[lane],
+                schedules: &self.schedules[lane],
+                plugged: &self.plugged,
+                kinds: self.kinds,
+            };
             with(&self.laws[usize::from(self.law_of[lane])], scene);
         }
         Ok(())
@@ -316,6 +339,7 @@ struct Scene<'a> {
     members: &'a mut [Member],
     lengths_m: &'a [f64],
     constraints: &'a [Duty],
+    schedules: &'a [Option<Schedule>],
     plugged: &'a [(ZoneId, u32)],
     kinds: u16,
 }
@@ -332,7 +356,7 @@ impl Scene<'_> {
 
     #[inline(always)]
     fn each(&mut self, mut with: impl FnMut(&VehicleState, &Situation, Partners<'_>, &mut Member)) {
-        for (state, member) in self.present.iter().zip(&mut *self.members) {
+        for (at, (state, member)) in self.present.iter().zip(&mut *self.members).enumerate() {
             if is_plugged(self.plugged, state) {
                 continue;
             }
@@ -344,11 +368,13 @@ impl Scene<'_> {
                 entry_speed_mps: state.entry_speed_mps,
                 length_m: self.lengths_m[state.path as usize],
                 terminal: member.terminal,
+                schedule: self.schedules.get(at).copied().flatten(),
                 // A kind nobody has heard of cannot be told apart from the first.
                 kind: if state.kind < self.kinds { state.kind } else { 0 },
             };
             let own = &self.constraints[member.first_constraint as usize..member.end_constraint as usize];
-            let partners = Partners { constraints: own.iter(), slice: self.slice, x_m: state.x_m };
+            let (slice, lengths_m) = (self.slice, self.lengths_m);
+            let partners = Partners { constraints: own.iter(), slice, lengths_m, x_m: state.x_m };
             with(state, &situation, partners, member);
         }
     }
@@ -391,6 +417,7 @@ impl Renewed {
     ) -> Result<(), PoolError> {
         self.members.clear();
         self.constraints.clear();
+        self.schedules.clear();
         let mut groups = assignments.chunk_by(|a, b| a.vehicle == b.vehicle);
         let mut known = before.iter().peekable();
         for state in slice.iter().filter(|state| !state.has_left()) {
@@ -418,6 +445,8 @@ impl Renewed {
             } else {
                 Terminal::Speed(group[0].terminal_speed_mps)
             };
+            let Assignment { scheduled_at_m: at_m, scheduled_time_s: time_s, .. } = group[0];
+            self.schedules.push((time_s > 0.0).then_some(Schedule { at_m, time_s }));
             self.members.push(Member {
                 vehicle: state.vehicle,
                 terminal,
@@ -425,6 +454,9 @@ impl Renewed {
                 first_constraint: first,
                 end_constraint: self.constraints.len() as u32,
             });
+        }
+        if self.schedules.iter().all(Option::is_none) {
+            self.schedules.clear();
         }
         match groups.next() {
             Some(group) => Err(PoolError::UnknownVehicle { zone, vehicle: group[0].vehicle }),
@@ -453,7 +485,9 @@ fn resolve(slice: &[VehicleState], a: &Assignment, v_max_mps: f64) -> Result<Opt
         && is_distance(a.gap_m)
         && !a.until_m.is_nan()
         && (a.own_conflict_m > 0.0 || !matches!(kind, Some(DutyKind::Merge | DutyKind::Cross)))
-        && (0.0..=v_max_mps).contains(&a.terminal_speed_mps);
+        && (0.0..=v_max_mps).contains(&a.terminal_speed_mps)
+        && is_distance(a.scheduled_at_m)
+        && a.scheduled_time_s.is_finite();
     if !sound {
         return Err(malformed);
     }
@@ -525,6 +559,10 @@ mod tests {
         for m in [f64::NAN, -200.0, 1e300] {
             assert!(judge(Assignment { own_conflict_m: m, ..good }).is_err(), "{m}");
             assert!(judge(Assignment { partner_conflict_m: m, ..good }).is_err(), "{m}");
+            assert!(judge(Assignment { scheduled_at_m: m, ..good }).is_err(), "{m}");
+        }
+        for s in [f64::NAN, f64::INFINITY] {
+            assert!(judge(Assignment { scheduled_time_s: s, ..good }).is_err(), "{s}");
         }
     }
 }

@@ -58,6 +58,8 @@ impl Assigner {
                 gap_m: 0.0,
                 until_m: f64::INFINITY,
                 terminal_speed_mps,
+                scheduled_at_m: 0.0,
+                scheduled_time_s: 0.0,
                 vehicle: state.vehicle,
                 partner: NO_VEHICLE,
                 zone: state.zone,

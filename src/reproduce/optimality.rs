@@ -250,15 +250,13 @@ fn drive(scenario: &Scenario, problem: &Problem, leader: Option<Leader>) -> (f64
             entry_speed_mps: problem.v0_mps,
             length_m: problem.length_m,
             terminal: problem.terminal,
+            schedule: None,
             kind: 0,
         };
         let partner = leader.map(|l| Partner {
-            kind: DutyKind::RearEnd,
-            x_m: l.x_m + l.v_mps * time_s,
-            v_mps: l.v_mps,
-            u_mps2: 0.0,
             conflict_m: problem.length_m,
             gap_m: scenario.vehicle.standstill_gap_m,
+            ..Partner::unplanned(DutyKind::RearEnd, l.x_m + l.v_mps * time_s, l.v_mps, 0.0)
         });
         let decision = law.decide(&situation, partner.into_iter(), &mut memory);
         let held = Held::new(x_m, v_mps, decision.u_mps2);

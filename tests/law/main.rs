@@ -82,12 +82,13 @@ fn at(time_s: f64, x_m: f64, v_mps: f64) -> Situation {
         entry_speed_mps: v_mps,
         length_m: LENGTH,
         terminal: Terminal::Speed(18.5),
+        schedule: None,
         kind: 0,
     }
 }
 
 fn ahead(x_m: f64, v_mps: f64, u_mps2: f64) -> Partner {
-    Partner { kind: DutyKind::RearEnd, x_m, v_mps, u_mps2, conflict_m: LENGTH, gap_m: 0.0 }
+    Partner { conflict_m: LENGTH, ..Partner::unplanned(DutyKind::RearEnd, x_m, v_mps, u_mps2) }
 }
 
 fn merging(x_m: f64, v_mps: f64, u_mps2: f64) -> Partner {

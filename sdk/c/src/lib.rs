@@ -80,9 +80,13 @@ pub struct Vehicle {
     pub merge_x_m: f64,
     /// Distance of the conflict point shared with `merge` on the vehicle's path, m; NaN without one.
     pub merge_at_m: f64,
+    /// Place on its path that its coordinator has scheduled it for, m; NaN when nothing is scheduled.
+    pub scheduled_at_m: f64,
+    /// Instant before which it is not to be there, s; NaN when nothing is scheduled.
+    pub scheduled_time_s: f64,
 }
 
-const _: () = assert!(size_of::<Vehicle>() == 40 + 3 * size_of::<usize>());
+const _: () = assert!(size_of::<Vehicle>() == 56 + 3 * size_of::<usize>());
 
 fn fail(message: &str) {
     let text = CString::new(message.replace('\0', " ")).unwrap_or_default();
@@ -197,6 +201,7 @@ impl Plugin {
         self.partners.clear();
         self.ends.clear();
         for vehicle in self.session.step().vehicles() {
+            let (scheduled_at_m, scheduled_time_s) = vehicle.schedule().unwrap_or((f64::NAN, f64::NAN));
             let mut found = Vehicle {
                 state: vehicle.state,
                 ahead: null(),
@@ -206,6 +211,8 @@ impl Plugin {
                 ahead_x_m: f64::NAN,
                 merge_x_m: f64::NAN,
                 merge_at_m: f64::NAN,
+                scheduled_at_m,
+                scheduled_time_s,
             };
             for control_zones_plugin::Partner { state, kind, x_m, conflict_m, gap_m } in vehicle.partners() {
                 let code = match kind {

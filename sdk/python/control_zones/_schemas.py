@@ -11,7 +11,7 @@ import ctypes
 import sys
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0x7e50f4f5fb4edbd2
+SCHEMA_HASH = 0x2291d52fc5522958
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -285,6 +285,11 @@ class Assignment(ctypes.Structure):
         until_m: Position of the partner on its own path from which on nothing is owed to it, m;
             infinite while the two drive on together.
         terminal_speed_mps: Terminal speed v_m the vehicle is to leave the zone with, m/s.
+        scheduled_at_m: Place on the vehicle's path that its coordinator has scheduled it for, m:
+            normally its last conflict point or its path's end. Like the terminal speed the same in
+            all records of a vehicle.
+        scheduled_time_s: Instant at which it is to be there, and before which it is not, s since
+            the start of the run; 0 when nothing is scheduled.
         vehicle: The vehicle bound by this record.
         partner: The vehicle it yields to, or `NO_VEHICLE`.
         zone: Zone index.
@@ -300,6 +305,8 @@ class Assignment(ctypes.Structure):
         ("gap_m", ctypes.c_double),
         ("until_m", ctypes.c_double),
         ("terminal_speed_mps", ctypes.c_double),
+        ("scheduled_at_m", ctypes.c_double),
+        ("scheduled_time_s", ctypes.c_double),
         ("vehicle", ctypes.c_uint32),
         ("partner", ctypes.c_uint32),
         ("zone", ctypes.c_uint32),
@@ -312,7 +319,7 @@ class Assignment(ctypes.Structure):
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
-        return "cz.Assignment.v2"
+        return "cz.Assignment.v3"
 
 
 class ZoneSummary(ctypes.Structure):
@@ -658,7 +665,7 @@ RECORDS = (
 TYPE_NAMES = {
     "FrameHeader": "cz.FrameHeader.v1",
     "VehicleState": "cz.VehicleState.v2",
-    "Assignment": "cz.Assignment.v2",
+    "Assignment": "cz.Assignment.v3",
     "ZoneSummary": "cz.ZoneSummary.v1",
     "VehicleCommand": "cz.VehicleCommand.v2",
     "Member": "cz.Member.v1",
@@ -712,7 +719,7 @@ _LAYOUTS = {
         },
     ),
     Assignment: (
-        64,
+        80,
         8,
         {
             "own_conflict_m": 0,
@@ -720,13 +727,15 @@ _LAYOUTS = {
             "gap_m": 16,
             "until_m": 24,
             "terminal_speed_mps": 32,
-            "vehicle": 40,
-            "partner": 44,
-            "zone": 48,
-            "point": 52,
-            "rank": 56,
-            "kind": 60,
-            "flags": 62,
+            "scheduled_at_m": 40,
+            "scheduled_time_s": 48,
+            "vehicle": 56,
+            "partner": 60,
+            "zone": 64,
+            "point": 68,
+            "rank": 72,
+            "kind": 76,
+            "flags": 78,
         },
     ),
     ZoneSummary: (

@@ -31,6 +31,8 @@ class ZoneView:
         entry_time, entry_speed: at the zone's origin, s and m/s.
         length: length of each vehicle's path, m.
         terminal: terminal speed to leave with, m/s; NaN where it is free.
+        scheduled_at, scheduled_time: place on its path that a vehicle is scheduled for, m, and the instant before which
+            it is not to be there, s; NaN where nothing is scheduled.
         ahead_x, ahead_v, ahead_u: the nearest vehicle ahead on the same way, in the vehicle's own coordinate; NaN
             where there is none.
         merge_x, merge_v, merge_u: the vehicle that passes the nearest conflict point first, in the vehicle's own
@@ -91,6 +93,14 @@ class ZoneView:
     def terminal(self):
         return self._once("terminal", lambda: _array(self._partners.terminal))
 
+    @property
+    def scheduled_at(self):
+        return self._once("scheduled_at", lambda: _array(self._partners.scheduled_at))
+
+    @property
+    def scheduled_time(self):
+        return self._once("scheduled_time", lambda: _array(self._partners.scheduled_time))
+
     ahead_x = property(lambda self: self._nearest("ahead", "x"))
     ahead_v = property(lambda self: self._nearest("ahead", "v"))
     ahead_u = property(lambda self: self._nearest("ahead", "u"))
@@ -148,6 +158,8 @@ class Partners:
         places = {int(states[i].vehicle): i for i in range(len(states))}
         order = {int(states[i].vehicle): n for n, i in enumerate(own)}
         self.terminal = [NAN] * len(own)
+        self.scheduled_at = [NAN] * len(own)
+        self.scheduled_time = [NAN] * len(own)
         #: For each vehicle: place of the partner, its id, kind, distances of the point on the two paths, gap, and
         #: from which position of the partner on nothing is owed.
         self._owed = [[] for _ in own]
@@ -157,6 +169,8 @@ class Partners:
                 continue
             if not a.flags & s.ASSIGNMENT_FREE_TERMINAL:
                 self.terminal[k] = a.terminal_speed_mps
+            if a.scheduled_time_s > 0:
+                self.scheduled_at[k], self.scheduled_time[k] = a.scheduled_at_m, a.scheduled_time_s
             place = places.get(a.partner)
             if place is not None and a.kind != s.CONSTRAINT_NONE:
                 owed = (place, a.partner, a.kind, a.own_conflict_m, a.partner_conflict_m, a.gap_m, a.until_m)

@@ -281,6 +281,13 @@ impl<'a> Vehicle<'a> {
         (a.flags & ASSIGNMENT_FREE_TERMINAL == 0).then_some(a.terminal_speed_mps)
     }
 
+    /// Place on its path, m, and instant before which it is not to be there, s, that its coordinator has scheduled
+    /// it for; `None` when nothing is scheduled.
+    pub fn schedule(&self) -> Option<(f64, f64)> {
+        let a = self.assignments.first()?;
+        (a.scheduled_time_s > 0.0).then_some((a.scheduled_at_m, a.scheduled_time_s))
+    }
+
     /// The vehicles it must respect where they are now.
     pub fn partners(&self) -> impl Iterator<Item = Partner<'a>> + use<'a> {
         let (slice, own_m) = (self.slice, self.state.x_m);

@@ -60,12 +60,14 @@ typedef struct cz_vehicle {
     double ahead_x_m;    /**< position of ahead in the vehicle's own coordinate, m, or NaN */
     double merge_x_m;    /**< position of merge in the vehicle's own coordinate, m, or NaN */
     double merge_at_m;   /**< distance of their conflict point on the vehicle's path, m, or NaN */
+    double scheduled_at_m;   /**< place on its path that it is scheduled for, m, or NaN */
+    double scheduled_time_s; /**< instant before which it is not to be there, s, or NaN */
 } cz_vehicle_t;
 
 #if defined(__cplusplus)
-static_assert(sizeof(cz_vehicle_t) == 40 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
+static_assert(sizeof(cz_vehicle_t) == 56 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
 #elif defined(__STDC_VERSION__) && __STDC_VERSION__ >= 201112L
-_Static_assert(sizeof(cz_vehicle_t) == 40 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
+_Static_assert(sizeof(cz_vehicle_t) == 56 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
 #endif
 
 /** A vehicle that another must respect where the two are now. */
