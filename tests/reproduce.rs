@@ -52,12 +52,13 @@ fn written_files_are_complete_and_figures_carry_text() {
 #[test]
 fn every_policy_meets_the_same_arrivals() {
     // The number of vehicles of each zone is the demand's: all policies of a replicate must agree.
-    use control_zones::reproduce::experiment::{Demand, FIXED, Policy, Replicate, Traffic};
+    use control_zones::reproduce::experiment::{Demand, FIXED, Policy, Setting, Traffic};
     use control_zones::reproduce::runs::Runs;
     let mut runs = Runs::new(2);
     for demand in Demand::ALL {
         for traffic in [Traffic::Constant, Traffic::Varying] {
-            let replicate = Replicate { demand, seed: 1, sets: &[] };
+            let setting = Setting::new(demand, vec![]).with_second(18.5);
+            let replicate = setting.replicate(1);
             let all = [Policy::None, FIXED, Policy::Feedback].map(|p| replicate.run(traffic, p));
             runs.perform(all.clone(), &mut |_, _| {}).expect("the runs succeed");
             let vehicles = all.map(|r| {
@@ -67,6 +68,37 @@ fn every_policy_meets_the_same_arrivals() {
             assert!(vehicles.iter().all(|v| *v == vehicles[0]), "{demand:?} {traffic:?} {vehicles:?}");
         }
     }
+}
+
+#[test]
+fn the_second_zone_ends_at_its_mean_exit_speed_without_flow_control() {
+    use control_zones::reproduce::experiment::{Demand, FIXED, Policy, Setting, Traffic};
+    use control_zones::reproduce::runs::Runs;
+    let mut runs = Runs::new(2);
+    let settings = vec![
+        Setting::new(Demand::Seeded, vec![]),
+        Setting::new(Demand::Seeded, vec!["vehicle.v_max_mps=16".to_owned()]),
+        Setting::new(Demand::Seeded, vec![]).with_second(18.5),
+    ];
+    let settled = Setting::settle(settings, &[Traffic::Constant], 3, &mut runs, &mut |_, _| {});
+    let settled = settled.expect("the runs succeed");
+    for setting in &settled[..2] {
+        let of = |seed| {
+            let run = setting.replicate(seed).run(Traffic::Constant, Policy::None);
+            runs.outcome(&run).exit_speeds_mps[1]
+        };
+        let mean = (1..=3).map(of).sum::<f64>() / 3.0;
+        let second = setting.second_mps[0].expect("measured");
+        assert!((second - mean).abs() <= 0.05 + 1e-9, "{second} {mean}");
+        let run = setting.replicate(2).run(Traffic::Constant, FIXED);
+        let flow = format!("zones.merge-2.flow={{ policy = \"fixed\", terminal_mps = {second:?} }}");
+        assert!(run.sets.contains(&flow), "{:?}", run.sets);
+        // Nobody asked for the other kind of traffic.
+        assert_eq!(setting.second_mps[1], None);
+    }
+    // The rule follows the setting, and a given speed goes before it.
+    assert!(settled[0].second_mps[0] > settled[1].second_mps[0], "{settled:?}");
+    assert_eq!(settled[2].second_mps, [Some(18.5); 2]);
 }
 
 #[test]

@@ -1,7 +1,8 @@
 //! The paper's experiments as runs: traffic, demand, policy, setting.
 
+use super::ReproduceError;
 use super::paper::SECOND_TERMINAL_MPS;
-use super::runs::{Run, VARYING_SCENARIO};
+use super::runs::{CONSTANT_SCENARIO, Progress, Run, Runs, VARYING_SCENARIO};
 use crate::scenario::ReferenceLaw;
 use serde::Serialize;
 
@@ -85,8 +86,8 @@ impl Variant {
     }
 }
 
-/// Flow control of the first zone. The second zone's terminal speed is 18.5 m/s under flow control and
-/// free without, as the paper has it.
+/// Flow control of the first zone. The second zone's terminal speed is v_m2 (see [`Setting`]) under flow
+/// control and free without, as the paper has it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Policy {
     /// No flow control in either zone: the baseline.
@@ -103,27 +104,100 @@ pub const FIXED: Policy = Policy::Fixed(15.0);
 /// Roads of both scenarios.
 pub const ROADS: [&str; 3] = ["main1", "merge1", "merge2"];
 
+/// Demand under further `--set`s, with the second zone's terminal speed v_m2 that belongs to it.
+///
+/// The paper sets v_m2 to the mean exit speed of the second zone without flow control. That depends on
+/// traffic and setting: it is measured for each, over all replicates, to 0.1 m/s as the paper prints it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Setting {
+    /// Where arrivals come from.
+    pub demand: Demand,
+    /// Further `--set`s.
+    pub sets: Vec<String>,
+    /// v_m2 under constant and under varying traffic, m/s, where it was asked for.
+    pub second_mps: [Option<f64>; 2],
+}
+
+impl Setting {
+    /// A setting in which nobody has measured v_m2: it has runs without flow control only.
+    pub fn new(demand: Demand, sets: Vec<String>) -> Setting {
+        Setting { demand, sets, second_mps: [None; 2] }
+    }
+
+    /// The same with a given v_m2.
+    pub fn with_second(self, second_mps: f64) -> Setting {
+        Setting { second_mps: [Some(second_mps); 2], ..self }
+    }
+
+    /// The runs v_m2 is measured in, as far as it is not given.
+    pub fn baselines(&self, traffics: &[Traffic], seeds: u64) -> Vec<Run> {
+        let open = traffics.iter().filter(|t| self.second_mps[**t as usize].is_none());
+        open.flat_map(|&traffic| self.without_control(traffic, seeds)).collect()
+    }
+
+    fn without_control(&self, traffic: Traffic, seeds: u64) -> Vec<Run> {
+        self.demand.seeds(seeds).map(|seed| self.replicate(seed).run(traffic, Policy::None)).collect()
+    }
+
+    /// The same with v_m2 from performed [baselines](Setting::baselines).
+    pub fn measured(mut self, traffics: &[Traffic], seeds: u64, runs: &Runs) -> Setting {
+        for &traffic in traffics {
+            if self.second_mps[traffic as usize].is_some() {
+                continue;
+            }
+            let baselines = self.without_control(traffic, seeds);
+            let speeds = baselines.iter().map(|run| runs.outcome(run).exit_speeds_mps[1]);
+            let speeds: Vec<f64> = speeds.filter(|speed| *speed > 0.0).collect();
+            // Where nobody got through there is nothing to measure, and every claim is undecided.
+            let mean = match speeds.len() {
+                0 => SECOND_TERMINAL_MPS,
+                n => speeds.iter().sum::<f64>() / n as f64,
+            };
+            self.second_mps[traffic as usize] = Some((10.0 * mean).round() / 10.0);
+        }
+        self
+    }
+
+    /// Performs the baselines of all settings and measures v_m2 in each.
+    pub fn settle(
+        settings: Vec<Setting>,
+        traffics: &[Traffic],
+        seeds: u64,
+        runs: &mut Runs,
+        progress: &mut Progress<'_>,
+    ) -> Result<Vec<Setting>, ReproduceError> {
+        runs.perform(settings.iter().flat_map(|s| s.baselines(traffics, seeds)), progress)?;
+        Ok(settings.into_iter().map(|s| s.measured(traffics, seeds, runs)).collect())
+    }
+
+    /// One of its replicates.
+    pub fn replicate(&self, seed: u64) -> Replicate<'_> {
+        Replicate { setting: self, seed }
+    }
+}
+
 /// One replicate: everything but the policy.
 #[derive(Clone, Copy, Debug)]
 pub struct Replicate<'a> {
-    /// Where arrivals come from.
-    pub demand: Demand,
+    /// Demand and setting.
+    pub setting: &'a Setting,
     /// Seed of the arrivals, the same for every policy.
     pub seed: u64,
-    /// Further `--set`s.
-    pub sets: &'a [String],
 }
 
 impl Replicate<'_> {
     /// The run of a policy on these arrivals.
+    ///
+    /// # Panics
+    /// When the policy has flow control and the setting is not [measured](Setting::measured) for this traffic.
     pub fn run(&self, traffic: Traffic, policy: Policy) -> Run {
         let (scenario, rates) = match traffic {
-            Traffic::Constant => ("two-merges", "[{ until_s = 7200.0, vehicles_per_hour = 400.0 }]"),
+            Traffic::Constant => (CONSTANT_SCENARIO, "[{ until_s = 7200.0, vehicles_per_hour = 400.0 }]"),
             Traffic::Varying => (VARYING_SCENARIO, ""),
         };
         let mut sets = Vec::new();
         for road in ROADS {
-            match (traffic, self.demand) {
+            match (traffic, self.setting.demand) {
                 // What the scenario has by itself.
                 (Traffic::Constant, Demand::Traces) | (Traffic::Varying, Demand::Seeded) => {}
                 (Traffic::Constant, Demand::Seeded) => sets.push(format!(
@@ -147,11 +221,11 @@ impl Replicate<'_> {
         };
         let second = match policy {
             Policy::None => first.clone(),
-            _ => fixed(SECOND_TERMINAL_MPS),
+            _ => fixed(self.setting.second_mps[traffic as usize].expect("the setting is measured")),
         };
         sets.push(format!("zones.merge-1.flow={first}"));
         sets.push(format!("zones.merge-2.flow={second}"));
-        sets.extend_from_slice(self.sets);
+        sets.extend_from_slice(&self.setting.sets);
         Run { scenario, seed: self.seed, sets }
     }
 }

@@ -103,7 +103,8 @@ pub fn report(report: &Report) -> String {
          95 % Student-t interval. *Seeded* is the random process, *SUMO* the three traces made with SUMO's \
          human drivers (three replicates: wide intervals). *Corrected* plans with β − ½b² + ac = 0, *as \
          printed* with the paper's misprint. Constant traffic uses β = 2/3, which the paper's table \
-         implies; varying traffic α = 0.25.\n\n",
+         implies; varying traffic α = 0.25. The second zone's v_m2 is the mean exit speed without flow \
+         control, as the paper defines it, measured per column and setting.\n\n",
     );
     if !report.claims.is_empty() {
         out.push_str("## Verdicts\n\n");

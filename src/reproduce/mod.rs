@@ -31,7 +31,7 @@ use runs::{Progress, Run, Runs};
 use sensitivity::Sensitivity;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
-use tables::SweepCurve;
+use tables::{Columns, SweepCurve};
 
 /// What is to be reproduced and how.
 #[derive(Clone, Debug, PartialEq)]
@@ -180,8 +180,11 @@ pub fn run(options: &Options, progress: &mut Progress<'_>) -> Result<Report, Rep
     let topics: Vec<_> = TOPICS.iter().filter(|t| has(Only::Errata) || has(Only::Erratum(t.id))).collect();
 
     let mut runs = Runs::new(options.jobs);
-    let mut wanted: Vec<Run> = labels.iter().flat_map(|l| runs_of(l, seeds)).collect();
-    wanted.extend(topics.iter().flat_map(|t| t.runs()));
+    let traffics: Vec<Traffic> = labels.iter().flat_map(|l| traffics_of(l)).copied().collect();
+    let columns = Columns::settle(&traffics, seeds, &mut runs, progress)?;
+    runs.perform(topics.iter().flat_map(|t| t.baselines()), progress)?;
+    let mut wanted: Vec<Run> = labels.iter().flat_map(|l| runs_of(l, &columns)).collect();
+    wanted.extend(topics.iter().flat_map(|t| t.runs(&runs)));
     runs.perform(wanted, progress)?;
     let sensitivity =
         if has(Only::Sensitivity) { Some(sensitivity::analyse(&mut runs, seeds, progress)?) } else { None };
@@ -191,7 +194,7 @@ pub fn run(options: &Options, progress: &mut Progress<'_>) -> Result<Report, Rep
         format: FORMAT,
         seeds,
         simulations: runs.len(),
-        claims: labels.iter().flat_map(|l| tables::judge_claims(l, &runs, seeds)).collect(),
+        claims: labels.iter().flat_map(|l| tables::judge_claims(l, &runs, &columns)).collect(),
         tables: Vec::new(),
         sweep: Vec::new(),
         rate: Vec::new(),
@@ -202,30 +205,38 @@ pub fn run(options: &Options, progress: &mut Progress<'_>) -> Result<Report, Rep
     for label in labels {
         let grids = match label {
             "fig:diff_v" => {
-                report.sweep = tables::sweep_curves(&runs, seeds);
-                tables::sweep_grids(&report.sweep, &runs, seeds)
+                report.sweep = tables::sweep_curves(&runs, &columns);
+                tables::sweep_grids(&report.sweep, &runs, &columns)
             }
-            "tab:fem_time" => tables::feasibility(&runs, seeds),
-            "tab:feedback1" => tables::performance(Traffic::Constant, &runs, seeds),
+            "tab:fem_time" => tables::feasibility(&runs, &columns),
+            "tab:feedback1" => tables::performance(Traffic::Constant, &runs, &columns),
             "fig:rate" => {
-                report.rate = tables::rate_curves(&runs, seeds);
-                vec![tables::rate_grid(&runs, seeds)]
+                report.rate = tables::rate_curves(&runs, &columns);
+                vec![tables::rate_grid(&runs, &columns)]
             }
-            _ => tables::performance(Traffic::Varying, &runs, seeds),
+            _ => tables::performance(Traffic::Varying, &runs, &columns),
         };
         report.tables.push((label, grids));
     }
     Ok(report)
 }
 
+/// Kinds of traffic a table or figure and its claims are about.
+fn traffics_of(label: &str) -> &'static [Traffic] {
+    match label {
+        "fig:rate" | "tab:feedback" => &[Traffic::Varying],
+        _ => &[Traffic::Constant],
+    }
+}
+
 /// The runs a table or figure and its claims need.
-fn runs_of(label: &str, seeds: u64) -> Vec<Run> {
-    let mut runs = tables::claim_runs(label, seeds);
+fn runs_of(label: &str, columns: &Columns) -> Vec<Run> {
+    let mut runs = tables::claim_runs(label, columns);
     runs.extend(match label {
-        "fig:diff_v" => tables::sweep_runs(seeds),
-        "tab:fem_time" => tables::feasibility_runs(seeds),
-        "tab:feedback1" => tables::performance_runs(Traffic::Constant, seeds),
-        _ => tables::performance_runs(Traffic::Varying, seeds),
+        "fig:diff_v" => tables::sweep_runs(columns),
+        "tab:fem_time" => tables::feasibility_runs(columns),
+        "tab:feedback1" => tables::performance_runs(Traffic::Constant, columns),
+        _ => tables::performance_runs(Traffic::Varying, columns),
     });
     runs
 }

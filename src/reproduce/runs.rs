@@ -96,6 +96,9 @@ fn drive(run: &mut InProcess, scenario: &Scenario) -> Result<bool, LockstepError
 /// passage takes some 10 to 20 s.
 const JAM_S: f64 = 120.0;
 
+/// Scenario of the experiments under constant traffic.
+pub const CONSTANT_SCENARIO: &str = "paper";
+
 /// Scenario of the varying-traffic experiment; its runs keep single visits.
 pub const VARYING_SCENARIO: &str = "varying-demand";
 

@@ -1,8 +1,9 @@
 //! Scenarios and arrival traces that are part of the program, so that it runs from any directory.
 
 /// Name and text, the default first.
-pub(super) const SCENARIOS: [(&str, &str); 9] = [
+pub(super) const SCENARIOS: [(&str, &str); 10] = [
     ("two-merges", include_str!("../../scenarios/two-merges.toml")),
+    ("paper", include_str!("../../scenarios/paper.toml")),
     ("varying-demand", include_str!("../../scenarios/varying-demand.toml")),
     ("corridor-8", include_str!("../../scenarios/corridor-8.toml")),
     ("tree", include_str!("../../scenarios/tree.toml")),

@@ -6,7 +6,7 @@ use clap::Args;
 /// Which scenario, and what is changed in it.
 #[derive(Clone, Debug, Args)]
 pub(in crate::app) struct ScenarioArgs {
-    /// Scenario: a TOML file, or one of the embedded two-merges (default), varying-demand, corridor-8,
+    /// Scenario: a TOML file, or one of the embedded two-merges (default), paper, varying-demand, corridor-8,
     /// tree, faulty-sensors.
     pub scenario: Option<String>,
     /// Seed of all random streams, in place of the scenario's.

@@ -117,9 +117,14 @@ pub struct Erratum {
 }
 
 impl Topic {
-    /// The runs its numbers need.
-    pub fn runs(&self) -> Vec<Run> {
-        if self.needs_runs { tables::runs() } else { Vec::new() }
+    /// The runs v_m2 is measured in.
+    pub fn baselines(&self) -> Vec<Run> {
+        if self.needs_runs { tables::baselines() } else { Vec::new() }
+    }
+
+    /// The runs its numbers need, once its [baselines](Topic::baselines) are performed.
+    pub fn runs(&self, runs: &Runs) -> Vec<Run> {
+        if self.needs_runs { tables::runs(runs) } else { Vec::new() }
     }
 
     /// The erratum with its numbers.

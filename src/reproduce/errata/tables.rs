@@ -1,6 +1,6 @@
 //! Numbers in tables that contradict each other or the text.
 
-use super::super::experiment::{Demand, FIXED, Policy, Replicate, Traffic};
+use super::super::experiment::{Demand, FIXED, Policy, Replicate, Setting, Traffic};
 use super::super::grid::{Entry, Grid, number};
 use super::super::paper::{self, COMPARISON, VARYING, alpha_of, beta_of};
 use super::super::runs::{Run, Runs};
@@ -11,19 +11,30 @@ const BETA_OF_ALPHA: &str = "objective={ alpha = 0.0625 }";
 const POLICIES: [(&str, Policy); 3] =
     [("feedback", Policy::Feedback), ("fixed 15", FIXED), ("none", Policy::None)];
 
-/// Simulations of the SUMO traces: both weights under constant traffic, and varying traffic.
-pub(super) fn runs() -> Vec<Run> {
-    let stated = [BETA_OF_ALPHA.to_owned()];
-    let mut runs = Vec::new();
-    for seed in Demand::Traces.seeds(0) {
-        for sets in [&[][..], &stated[..]] {
-            let replicate = Replicate { demand: Demand::Traces, seed, sets };
-            runs.extend(POLICIES.map(|(_, p)| replicate.run(Traffic::Constant, p)));
-        }
-        let replicate = Replicate { demand: Demand::Traces, seed, sets: &[] };
-        runs.push(replicate.run(Traffic::Varying, Policy::None));
-    }
-    runs
+const TRAFFICS: [Traffic; 2] = [Traffic::Constant, Traffic::Varying];
+
+/// The SUMO traces under the weight the tables imply, and under the stated one.
+fn settings() -> [Setting; 2] {
+    [vec![], vec![BETA_OF_ALPHA.to_owned()]].map(|sets| Setting::new(Demand::Traces, sets))
+}
+
+fn measured(runs: &Runs) -> [Setting; 2] {
+    settings().map(|s| s.measured(&TRAFFICS, 0, runs))
+}
+
+fn replicates(setting: &Setting) -> impl Iterator<Item = Replicate<'_>> {
+    Demand::Traces.seeds(0).map(|seed| setting.replicate(seed))
+}
+
+/// Simulations without flow control, under both kinds of traffic.
+pub(super) fn baselines() -> Vec<Run> {
+    settings().iter().flat_map(|s| s.baselines(&TRAFFICS, 0)).collect()
+}
+
+/// Simulations of the SUMO traces under constant traffic.
+pub(super) fn runs(runs: &Runs) -> Vec<Run> {
+    let of = |r: Replicate<'_>| POLICIES.map(|(_, p)| r.run(Traffic::Constant, p));
+    measured(runs).iter().flat_map(|s| replicates(s).flat_map(of)).collect()
 }
 
 pub(super) fn alpha_beta(runs: &Runs) -> Vec<Grid> {
@@ -65,16 +76,13 @@ pub(super) fn alpha_beta(runs: &Runs) -> Vec<Grid> {
         "What it changes: our totals on the three SUMO traces, ± 95 %",
         ["policy", "paper", "β = 2/3", "β = 8/15 (α = 0.0625)"],
     );
-    let stated = [BETA_OF_ALPHA.to_owned()];
+    let [ours, stated] = measured(runs);
     for ((name, policy), column) in POLICIES.into_iter().zip(&COMPARISON.columns) {
-        let total = |sets: &[String]| {
-            let of = |seed| {
-                runs.outcome(&Replicate { demand: Demand::Traces, seed, sets }.run(Traffic::Constant, policy))
-                    .total()
-            };
-            Entry::from(Interval::of(&Demand::Traces.seeds(0).map(of).collect::<Vec<f64>>()))
+        let total = |setting: &Setting| {
+            let of = |r: Replicate<'_>| runs.outcome(&r.run(Traffic::Constant, policy)).total();
+            Entry::from(Interval::of(&replicates(setting).map(of).collect::<Vec<f64>>()))
         };
-        simulated.row([name.into(), number(column.total, 2), total(&[]), total(&stated)]);
+        simulated.row([name.into(), number(column.total, 2), total(&ours), total(&stated)]);
     }
     vec![implied, simulated]
 }
@@ -85,20 +93,20 @@ pub(super) fn repeated_column(runs: &Runs) -> Vec<Grid> {
         ["metric", "paper constant", "paper varying", "ours constant", "ours varying", "paired difference"],
     );
     let [constant, varying] = [&COMPARISON, &VARYING].map(|t| t.columns[2].zones);
+    let [ours, _] = settings();
     for zone in 0..2 {
         for (name, printed, index) in [
             ("time, s", [constant[zone].time_s, varying[zone].time_s], 0),
             ("energy, m²/s³", [constant[zone].energy, varying[zone].energy], 1),
         ] {
-            let ours = |traffic| -> Vec<f64> {
-                let of = |seed| {
-                    let replicate = Replicate { demand: Demand::Traces, seed, sets: &[] };
-                    let zone = &runs.outcome(&replicate.run(traffic, Policy::None)).zones[zone];
+            let values = |traffic| -> Vec<f64> {
+                let of = |r: Replicate<'_>| {
+                    let zone = &runs.outcome(&r.run(traffic, Policy::None)).zones[zone];
                     if index == 0 { zone.mean_time_s } else { zone.mean_energy }
                 };
-                Demand::Traces.seeds(0).map(of).collect()
+                replicates(&ours).map(of).collect()
             };
-            let [a, b] = [Traffic::Constant, Traffic::Varying].map(ours);
+            let [a, b] = TRAFFICS.map(values);
             let difference: Vec<f64> = b.iter().zip(&a).map(|(b, a)| b - a).collect();
             grid.row([
                 format!("CZ{} {name}", zone + 1).into(),

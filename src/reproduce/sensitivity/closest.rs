@@ -1,24 +1,24 @@
 //! The setting that comes closest to the paper's tables.
 
 use super::super::ReproduceError;
-use super::super::experiment::{FIXED, Policy, Traffic};
+use super::super::experiment::{FIXED, Policy, Setting, Traffic};
 use super::super::grid::{Grid, number};
 use super::super::paper::{COMPARISON, FEASIBILITY};
 use super::super::runs::{Outcome, Progress, Run, Runs};
-use super::{Closest, demand, entry_speed, replicate};
+use super::{Closest, demand, entry_speed, seeded};
 
 const COLUMNS: [(&str, Policy); 3] =
     [("feedback", Policy::Feedback), ("fixed 15", FIXED), ("none", Policy::None)];
 
-pub(super) fn cell_runs(sets: &[String], n: u64) -> Vec<Run> {
-    let of = |seed| COLUMNS.map(|(_, p)| replicate(seed, sets).run(Traffic::Constant, p));
+pub(super) fn cell_runs(setting: &Setting, n: u64) -> Vec<Run> {
+    let of = |seed| COLUMNS.map(|(_, p)| setting.replicate(seed).run(Traffic::Constant, p));
     (1..=n).flat_map(of).collect()
 }
 
 /// (name, paper, ours): times and energies of `tab:feedback1`, FE counts and times of `tab:fem_time`.
-fn cells(runs: &Runs, sets: &[String], n: u64) -> Vec<(String, f64, f64)> {
+fn cells(runs: &Runs, setting: &Setting, n: u64) -> Vec<(String, f64, f64)> {
     let mean = |p, value: &dyn Fn(&Outcome) -> f64| {
-        let of = |seed| value(runs.outcome(&replicate(seed, sets).run(Traffic::Constant, p)));
+        let of = |seed| value(runs.outcome(&setting.replicate(seed).run(Traffic::Constant, p)));
         (1..=n).map(of).sum::<f64>() / n as f64
     };
     let mut cells = Vec::new();
@@ -80,7 +80,8 @@ fn search_levels() -> Vec<Vec<Vec<String>>> {
 
 /// What the search found: see [`Closest`].
 pub(super) struct Found {
-    pub sets: Vec<String>,
+    pub ours: Setting,
+    pub setting: Setting,
     pub deviation: (f64, f64),
     pub tried: usize,
 }
@@ -90,11 +91,22 @@ pub(super) struct Found {
 pub(super) fn search(runs: &mut Runs, n: u64, progress: &mut Progress<'_>) -> Result<Found, ReproduceError> {
     let levels = search_levels();
     let mut at = vec![0; levels.len()];
-    let sets = |at: &[usize]| -> Vec<String> {
-        at.iter().zip(&levels).flat_map(|(&level, levels)| levels[level].clone()).collect()
+    let setting = |at: &[usize]| {
+        seeded(at.iter().zip(&levels).flat_map(|(&level, levels)| levels[level].clone()).collect())
     };
-    let (start, mut tried) = (deviation(&cells(runs, &[], n)), 1);
-    let mut best = start;
+    let mut measure =
+        |settings: Vec<Setting>, runs: &mut Runs| -> Result<Vec<(Setting, f64)>, ReproduceError> {
+            let settings = Setting::settle(settings, &[Traffic::Constant], n, runs, progress)?;
+            runs.perform(settings.iter().flat_map(|s| cell_runs(s, n)), progress)?;
+            let measured = |s: Setting| {
+                let value = deviation(&cells(runs, &s, n));
+                (s, value)
+            };
+            Ok(settings.into_iter().map(measured).collect())
+        };
+    let (ours, start) = measure(vec![setting(&at)], runs)?.remove(0);
+    let mut found = ours.clone();
+    let (mut best, mut tried) = (start, 1);
     for _ in 0..2 {
         let before = at.clone();
         for choice in 0..levels.len() {
@@ -106,12 +118,11 @@ pub(super) fn search(runs: &mut Runs, n: u64, progress: &mut Progress<'_>) -> Re
                     candidate
                 })
                 .collect();
-            runs.perform(candidates.iter().flat_map(|c| cell_runs(&sets(c), n)), progress)?;
-            for candidate in candidates {
-                let value = deviation(&cells(runs, &sets(&candidate), n));
+            let measured = measure(candidates.iter().map(|c| setting(c)).collect(), runs)?;
+            for (candidate, (setting, value)) in candidates.into_iter().zip(measured) {
                 tried += 1;
                 if value < best {
-                    (best, at) = (value, candidate);
+                    (best, at, found) = (value, candidate, setting);
                 }
             }
         }
@@ -119,10 +130,10 @@ pub(super) fn search(runs: &mut Runs, n: u64, progress: &mut Progress<'_>) -> Re
             break;
         }
     }
-    Ok(Found { sets: sets(&at), deviation: (start, best), tried })
+    Ok(Found { ours, setting: found, deviation: (start, best), tried })
 }
 
-pub(super) fn closest_grids(runs: &Runs, closest: &Closest, n: u64) -> Vec<Grid> {
+pub(super) fn closest_grids(runs: &Runs, closest: &Closest, found: &Found, n: u64) -> Vec<Grid> {
     let mut setting = Grid::new(
         format!(
             "Closest setting of {} tried: root mean square relative deviation over 16 cells {:.1} % (ours {:.1} %)",
@@ -137,8 +148,8 @@ pub(super) fn closest_grids(runs: &Runs, closest: &Closest, n: u64) -> Vec<Grid>
         format!("The cells, means over {n} seeds"),
         ["cell", "paper", "our setting", "closest setting", "deviation of the closest, %"],
     );
-    let ours = cells(runs, &[], n);
-    for ((name, paper, value), (_, _, own)) in cells(runs, &closest.sets, n).into_iter().zip(ours) {
+    let ours = cells(runs, &found.ours, n);
+    for ((name, paper, value), (_, _, own)) in cells(runs, &found.setting, n).into_iter().zip(ours) {
         let off = 100.0 * (value / paper - 1.0);
         table.row([name.into(), number(paper, 2), number(own, 2), number(value, 2), number(off, 0)]);
     }

@@ -8,11 +8,12 @@ mod closest;
 
 use super::ReproduceError;
 use super::claims::{CLAIMS, Claim, Verdict, judge};
-use super::experiment::{Demand, FIXED, Policy, ROADS, Replicate, Traffic};
+use super::experiment::{Demand, FIXED, Policy, ROADS, Setting, Traffic};
 use super::grid::{Entry, Grid, number};
+use super::paper::SECOND_TERMINAL_MPS;
 use super::runs::{Progress, Run, Runs};
 use super::statistics::Interval;
-use closest::{Found, cell_runs, closest_grids, search};
+use closest::{cell_runs, closest_grids, search};
 use serde::Serialize;
 use std::collections::BTreeSet;
 
@@ -27,13 +28,27 @@ const SPEEDS: [f64; 6] = [12.0, 14.0, 15.0, 16.0, 18.0, 20.0];
 struct Choice {
     name: &'static str,
     ours: &'static str,
-    /// Name and `--set`s of each other level.
-    levels: Vec<(String, Vec<String>)>,
+    levels: Vec<Level>,
+}
+
+/// A level other than ours.
+struct Level {
+    name: String,
+    sets: Vec<String>,
+    /// v_m2 where it is given, m/s.
+    second_mps: Option<f64>,
+}
+
+impl Level {
+    fn new((name, sets): (String, Vec<String>)) -> Level {
+        Level { name, sets, second_mps: None }
+    }
 }
 
 fn choice(name: &'static str, ours: &'static str, levels: &[(&str, &[&str])]) -> Choice {
-    let level =
-        |&(name, sets): &(&str, &[&str])| (name.to_owned(), sets.iter().map(|s| (*s).to_owned()).collect());
+    let level = |&(name, sets): &(&str, &[&str])| {
+        Level::new((name.to_owned(), sets.iter().map(|s| (*s).to_owned()).collect()))
+    };
     Choice { name, ours, levels: levels.iter().map(level).collect() }
 }
 
@@ -49,7 +64,9 @@ fn entry_speed(mean: f64) -> (String, Vec<String>) {
 }
 
 fn choices() -> Vec<Choice> {
-    let headway = |h: f64| (format!("{h}"), demand("min_headway_s", h));
+    let headway = |h: f64| Level::new((format!("{h}"), demand("min_headway_s", h)));
+    let printed =
+        Level { name: format!("{SECOND_TERMINAL_MPS}"), sets: vec![], second_mps: Some(SECOND_TERMINAL_MPS) };
     vec![
         choice("Δt, s", "0.1", &[("0.05", &["dt_s=0.05"]), ("0.2", &["dt_s=0.2"])]),
         choice(
@@ -76,7 +93,11 @@ fn choices() -> Vec<Choice> {
                 ("no CLF row", &["control.clf=false"]),
             ],
         ),
-        Choice { name: "entry speed, m/s", ours: "16", levels: [13.0, 18.0, 20.0].map(entry_speed).into() },
+        Choice {
+            name: "entry speed, m/s",
+            ours: "16",
+            levels: [13.0, 18.0, 20.0].map(entry_speed).map(Level::new).into(),
+        },
         Choice { name: "least headway, s", ours: "1.2", levels: [0.6, 1.8, 2.4].map(headway).into() },
         choice(
             "FE conditions",
@@ -90,6 +111,7 @@ fn choices() -> Vec<Choice> {
         choice("re-planning", "from_entry", &[("from_state", &["control.replan=from_state"])]),
         choice("position feedback", "approximate", &[("exact", &["control.position_feedback=exact"])]),
         choice("safety rows", "continuous", &[("sampled", &["control.safety_rows=sampled"])]),
+        Choice { name: "v_m2, m/s", ours: "mean exit speed without flow control", levels: vec![printed] },
         choice("reference", "corrected", &[("as printed", &["control.reference=as_printed"])]),
     ]
 }
@@ -118,6 +140,8 @@ pub struct SettingRow {
     pub level: String,
     /// `--set`s.
     pub sets: Vec<String>,
+    /// v_m2 under constant and under varying traffic, m/s.
+    pub second_mps: [Option<f64>; 2],
     /// Runs in which traffic came to a standstill; claims that need one of them are undecided.
     pub jammed: usize,
     /// Per claim.
@@ -153,9 +177,11 @@ pub struct Sensitivity {
 /// A claim's effect, replicate by replicate.
 type PerReplicate = Vec<Option<f64>>;
 
-fn replicate(seed: u64, sets: &[String]) -> Replicate<'_> {
-    Replicate { demand: Demand::Seeded, seed, sets }
+fn seeded(sets: Vec<String>) -> Setting {
+    Setting::new(Demand::Seeded, sets)
 }
+
+const TRAFFICS: [Traffic; 2] = [Traffic::Constant, Traffic::Varying];
 
 /// Runs everything.
 pub fn analyse(
@@ -165,51 +191,66 @@ pub fn analyse(
 ) -> Result<Sensitivity, ReproduceError> {
     let (replicates, few) = (seeds.min(MOST_REPLICATES), seeds.min(FEW_REPLICATES));
     let choices = choices();
-    let mut named = vec![("ours", "", Vec::new())];
-    named.extend(choices.iter().flat_map(|c| c.levels.iter().map(|(l, s)| (c.name, l.as_str(), s.clone()))));
-    let needs = |sets: &[String], n: u64| -> Vec<Run> {
-        let of = |seed| CLAIMS.iter().flat_map(move |c| c.runs(&replicate(seed, sets), &SPEEDS));
+    let mut names = vec![("ours", "")];
+    let mut settings = vec![seeded(Vec::new())];
+    for (choice, level) in choices.iter().flat_map(|c| c.levels.iter().map(move |l| (c.name, l))) {
+        names.push((choice, &level.name));
+        let setting = seeded(level.sets.clone());
+        settings.push(level.second_mps.map_or(setting.clone(), |second| setting.with_second(second)));
+    }
+    let settings = Setting::settle(settings, &TRAFFICS, replicates, runs, progress)?;
+    let needs = |setting: &Setting, n: u64| -> Vec<Run> {
+        let of = |seed| CLAIMS.iter().flat_map(move |c| c.runs(&setting.replicate(seed), &SPEEDS));
         (1..=n).flat_map(of).collect()
     };
-    let points = design_points();
-    let mut wanted: Vec<Run> = named.iter().flat_map(|(_, _, sets)| needs(sets, replicates)).collect();
-    wanted.extend(points.iter().flat_map(|sets| cell_runs(sets, few)));
-    wanted.extend(solver_runs());
+    let points = design_points().into_iter().map(seeded).collect();
+    let points = Setting::settle(points, &[Traffic::Constant], few, runs, progress)?;
+    let mut wanted: Vec<Run> = settings.iter().flat_map(|s| needs(s, replicates)).collect();
+    wanted.extend(points.iter().flat_map(|s| cell_runs(s, few)));
+    wanted.extend(solver_runs(&settings[0]));
     runs.perform(wanted, progress)?;
 
-    let ours = effects_by_replicate(runs, &[], replicates);
-    let row = |(choice, level, sets): &(&'static str, &str, Vec<String>)| SettingRow {
+    let ours = effects_by_replicate(runs, &settings[0], replicates);
+    let row = |(&(choice, level), setting): (&(&'static str, &str), &Setting)| SettingRow {
         choice,
-        level: (*level).to_owned(),
-        sets: sets.clone(),
-        jammed: needs(sets, replicates)
+        level: level.to_owned(),
+        sets: setting.sets.clone(),
+        second_mps: setting.second_mps,
+        jammed: needs(setting, replicates)
             .into_iter()
             .collect::<BTreeSet<Run>>()
             .iter()
             .filter(|run| !runs.outcome(run).complete)
             .count(),
-        effects: effects(runs, sets, replicates, &ours),
+        effects: effects(runs, setting, replicates, &ours),
     };
-    let settings: Vec<SettingRow> = named.iter().map(row).collect();
-    let mut grids = vec![one_at_a_time_grid(&settings, &choices), movers_grid(&settings)];
+    let rows: Vec<SettingRow> = names.iter().zip(&settings).map(row).collect();
+    let mut grids = vec![one_at_a_time_grid(&rows, &choices), movers_grid(&rows)];
     grids.push(design_grid(runs, &points, few));
-    grids.push(solver_grid(runs));
+    grids.push(solver_grid(runs, &settings[0]));
 
-    let Found { sets, deviation, tried } = search(runs, few, progress)?;
-    runs.perform(needs(&sets, replicates), progress)?;
-    let closest = Closest { effects: effects(runs, &sets, replicates, &ours), sets, deviation, tried };
-    grids.extend(closest_grids(runs, &closest, few));
-    Ok(Sensitivity { replicates, settings, closest, grids })
+    let found = search(runs, few, progress)?;
+    let closest = vec![seeded(found.setting.sets.clone())];
+    let closest = Setting::settle(closest, &TRAFFICS, replicates, runs, progress)?.remove(0);
+    runs.perform(needs(&closest, replicates), progress)?;
+    let closest = Closest {
+        effects: effects(runs, &closest, replicates, &ours),
+        sets: closest.sets,
+        deviation: found.deviation,
+        tried: found.tried,
+    };
+    grids.extend(closest_grids(runs, &closest, &found, few));
+    Ok(Sensitivity { replicates, settings: rows, closest, grids })
 }
 
-fn effects_by_replicate(runs: &Runs, sets: &[String], n: u64) -> Vec<PerReplicate> {
+fn effects_by_replicate(runs: &Runs, setting: &Setting, n: u64) -> Vec<PerReplicate> {
     let of =
-        |claim: &Claim| (1..=n).map(|seed| claim.effect(runs, &replicate(seed, sets), &SPEEDS)).collect();
+        |claim: &Claim| (1..=n).map(|seed| claim.effect(runs, &setting.replicate(seed), &SPEEDS)).collect();
     CLAIMS.iter().map(of).collect()
 }
 
-fn effects(runs: &Runs, sets: &[String], n: u64, ours: &[PerReplicate]) -> Vec<SettingEffect> {
-    let here = effects_by_replicate(runs, sets, n);
+fn effects(runs: &Runs, setting: &Setting, n: u64, ours: &[PerReplicate]) -> Vec<SettingEffect> {
+    let here = effects_by_replicate(runs, setting, n);
     let each = |((claim, here), ours): ((&Claim, PerReplicate), &PerReplicate)| {
         let effect = here.iter().copied().collect::<Option<Vec<f64>>>().and_then(|e| Interval::of(&e));
         let change: Option<Vec<f64>> = here.iter().zip(ours).map(|(a, b)| Some((*a)? - (*b)?)).collect();
@@ -311,7 +352,7 @@ fn design_points() -> Vec<Vec<String>> {
 }
 
 /// Main effects and two-factor interactions.
-fn design_grid(runs: &Runs, points: &[Vec<String>], n: u64) -> Grid {
+fn design_grid(runs: &Runs, points: &[Setting], n: u64) -> Grid {
     const RESPONSES: [&str; 5] =
         ["fixed-15-percent", "feedback-15-percent", "feedback-like-fixed", "fe-count", "fe-time"];
     let responses = RESPONSES.map(|id| CLAIMS.iter().find(|c| c.id == id).expect("a claim of that name"));
@@ -322,9 +363,9 @@ fn design_grid(runs: &Runs, points: &[Vec<String>], n: u64) -> Grid {
     // Contrast of the points whose sign is the product of the factors in `mask`.
     let contrast = |claim: &Claim, mask: usize| {
         let per_replicate = (1..=n).map(|seed| {
-            let signed = points.iter().enumerate().map(|(bits, sets)| {
+            let signed = points.iter().enumerate().map(|(bits, setting)| {
                 let sign = if (bits & mask).count_ones() % 2 == mask.count_ones() % 2 { 1.0 } else { -1.0 };
-                Some(sign * claim.effect(runs, &replicate(seed, sets), &SPEEDS)?)
+                Some(sign * claim.effect(runs, &setting.replicate(seed), &SPEEDS)?)
             });
             Some(signed.sum::<Option<f64>>()? / (points.len() / 2) as f64)
         });
@@ -346,25 +387,25 @@ fn design_grid(runs: &Runs, points: &[Vec<String>], n: u64) -> Grid {
 }
 
 /// The shortened runs on which both solvers are compared.
-fn solver_runs() -> Vec<Run> {
+fn solver_runs(ours: &Setting) -> Vec<Run> {
     ["closed_form", "clarabel"]
         .into_iter()
-        .flat_map(|solver| [Policy::None, FIXED, Policy::Feedback].map(|p| solver_run(solver, p)))
+        .flat_map(|solver| [Policy::None, FIXED, Policy::Feedback].map(|p| solver_run(ours, solver, p)))
         .collect()
 }
 
-fn solver_run(solver: &str, policy: Policy) -> Run {
-    let sets = ["end.vehicles=12".to_owned(), format!("control.solver={solver}")];
-    replicate(1, &sets).run(Traffic::Constant, policy)
+fn solver_run(ours: &Setting, solver: &str, policy: Policy) -> Run {
+    let sets = vec!["end.vehicles=12".to_owned(), format!("control.solver={solver}")];
+    Setting { sets, ..ours.clone() }.replicate(1).run(Traffic::Constant, policy)
 }
 
-fn solver_grid(runs: &Runs) -> Grid {
+fn solver_grid(runs: &Runs, ours: &Setting) -> Grid {
     let mut grid = Grid::new(
         "Solver, first 12 vehicles of seed 1: total objective",
         ["policy", "closed form", "Clarabel", "difference"],
     );
     for (name, policy) in [("none", Policy::None), ("fixed 15", FIXED), ("feedback", Policy::Feedback)] {
-        let [a, b] = ["closed_form", "clarabel"].map(|s| runs.outcome(&solver_run(s, policy)).total());
+        let [a, b] = ["closed_form", "clarabel"].map(|s| runs.outcome(&solver_run(ours, s, policy)).total());
         grid.row([name.into(), number(a, 6), number(b, 6), format!("{:.1e}", b - a).into()]);
     }
     grid
