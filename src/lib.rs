@@ -3,6 +3,8 @@
 
 pub mod app;
 pub mod bench;
+pub mod bounds;
+pub mod compare;
 pub mod conflict;
 pub mod control;
 pub mod coordination;

@@ -77,7 +77,7 @@ fn the_second_zone_ends_at_its_mean_exit_speed_without_flow_control() {
     let mut runs = Runs::new(2);
     let settings = vec![
         Setting::new(Demand::Seeded, vec![]),
-        Setting::new(Demand::Seeded, vec!["vehicle.v_max_mps=16".to_owned()]),
+        Setting::new(Demand::Seeded, vec!["objective={ beta = 0.3 }".to_owned()]),
         Setting::new(Demand::Seeded, vec![]).with_second(18.5),
     ];
     let settled = Setting::settle(settings, &[Traffic::Constant], 3, &mut runs, &mut |_, _| {});

@@ -23,6 +23,7 @@ mod supervise;
 #[cfg(fuzzing)]
 pub use show::everything as show_everything;
 
+use crate::compare::CompareError;
 use crate::process::ProcessError;
 use crate::reproduce::{self, ReproduceError};
 use crate::scenario::ScenarioError;
@@ -83,6 +84,20 @@ impl From<ReproduceError> for AppError {
     }
 }
 
+impl From<CompareError> for AppError {
+    fn from(error: CompareError) -> AppError {
+        match error {
+            CompareError::Failed(_) => AppError::Failed(error.to_string()),
+            _ => AppError::Usage(error.to_string()),
+        }
+    }
+}
+
+/// `cz compare`.
+fn compare(args: &crate::compare::cli::CompareArgs) -> Result<(), AppError> {
+    print(&crate::compare::cli::main(args)?)
+}
+
 /// Has a panic end in one line, the last that is said: a supervisor shows a part's last words.
 fn say_panics_in_a_line(program: &'static str) {
     std::panic::set_hook(Box::new(move |panic| {
@@ -126,6 +141,7 @@ pub fn cz() -> ExitCode {
             args::Command::Resume(args) => resume::resume(&args),
             args::Command::Branch(args) => resume::branch(&args),
             args::Command::Reproduce(args) => reproduce::cli::main(&args).map_err(AppError::from),
+            args::Command::Compare(args) => compare(&args),
             args::Command::Clean(args) => clean::clean(&args),
             args::Command::Bench(args) => bench::bench(&args),
             args::Command::Plugin { command } => plugin::plugin(&command),

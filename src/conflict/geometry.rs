@@ -127,9 +127,9 @@ impl Conflicts {
 
     /// The first path that passes a conflict point, and where on it, m.
     pub fn first_use(&self, point: u32) -> Option<(u32, f64)> {
-        (0..).zip(&self.paths).find_map(|(path, own)| {
-            own.uses.iter().find(|u| u.point == point).map(|u| (path, u.at_m))
-        })
+        (0..)
+            .zip(&self.paths)
+            .find_map(|(path, own)| own.uses.iter().find(|u| u.point == point).map(|u| (path, u.at_m)))
     }
 
     /// Length of a path, m.

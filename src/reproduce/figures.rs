@@ -16,15 +16,26 @@ use std::path::Path;
 use std::sync::Once;
 
 /// Size of every figure, pixels.
-const SIZE: (u32, u32) = (900, 560);
-const AXIS_FONT: (&str, u32) = ("sans-serif", 16);
-const LABEL_FONT: (&str, u32) = ("sans-serif", 14);
+pub(crate) const SIZE: (u32, u32) = (900, 560);
+pub(crate) const AXIS_FONT: (&str, u32) = ("sans-serif", 16);
+pub(crate) const LABEL_FONT: (&str, u32) = ("sans-serif", 14);
 const BLUE: RGBColor = RGBColor(31, 119, 180);
 const ORANGE: RGBColor = RGBColor(255, 127, 14);
 const GREEN: RGBColor = RGBColor(44, 160, 44);
 const GREY: RGBColor = RGBColor(110, 110, 110);
+/// Colours that can be told apart, for series that have no meaning of their own.
+pub(crate) const COLOURS: [RGBColor; 8] = [
+    BLUE,
+    ORANGE,
+    GREEN,
+    RGBColor(214, 39, 40),
+    RGBColor(148, 103, 189),
+    RGBColor(140, 86, 75),
+    RGBColor(23, 190, 207),
+    GREY,
+];
 
-fn font() {
+pub(crate) fn font() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
         for style in [FontStyle::Normal, FontStyle::Bold] {
@@ -34,13 +45,14 @@ fn font() {
     });
 }
 
-fn broken(path: &Path, error: impl std::fmt::Display) -> ReproduceError {
+pub(crate) fn broken(path: &Path, error: impl std::fmt::Display) -> ReproduceError {
     ReproduceError::Figure { path: path.to_owned(), error: error.to_string() }
 }
 
 /// Writes `name.svg` and `name.png`.
 macro_rules! both_formats {
     ($dir:expr, $name:expr, $draw:expr) => {{
+        use $crate::reproduce::figures::{SIZE, broken, font};
         font();
         let svg = $dir.join(format!("{}.svg", $name));
         $draw(SVGBackend::new(&svg, SIZE).into_drawing_area()).map_err(|e| broken(&svg, e))?;
@@ -49,6 +61,7 @@ macro_rules! both_formats {
         Ok(())
     }};
 }
+pub(crate) use both_formats;
 
 /// Draws `fig:diff_v` for one variant.
 pub fn sweep(dir: &Path, name: &str, curve: &SweepCurve) -> Result<(), ReproduceError> {
@@ -60,7 +73,7 @@ pub fn rate(dir: &Path, name: &str, title: &str, curves: &[Curve]) -> Result<(),
     both_formats!(dir, name, |area| draw_rate(area, title, curves))
 }
 
-type Drawn<DB> = Result<(), DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorType>>;
+pub(crate) type Drawn<DB> = Result<(), DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorType>>;
 
 fn draw_sweep<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, curve: &SweepCurve) -> Drawn<DB> {
     area.fill(&WHITE)?;
@@ -175,7 +188,7 @@ fn draw_rate<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, title: &str, curv
     area.present()
 }
 
-type Plane = Cartesian2d<RangedCoordf64, RangedCoordf64>;
+pub(crate) type Plane = Cartesian2d<RangedCoordf64, RangedCoordf64>;
 
 /// Draws the axes, with whole numbers at about `x_labels` places of the lower one.
 fn axes<DB: DrawingBackend>(
@@ -197,7 +210,7 @@ fn axes<DB: DrawingBackend>(
 }
 
 /// Draws what the series are called.
-fn legend<'a, DB: DrawingBackend + 'a>(
+pub(crate) fn legend<'a, DB: DrawingBackend + 'a>(
     chart: &mut ChartContext<'a, DB, Plane>,
     position: SeriesLabelPosition,
 ) -> Drawn<DB> {

@@ -15,6 +15,7 @@ pub mod grid;
 pub mod markdown;
 pub mod optimality;
 pub mod paper;
+pub mod parallel;
 pub mod rate;
 pub mod runs;
 pub mod sensitivity;

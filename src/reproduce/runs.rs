@@ -5,11 +5,11 @@
 //! read in a fixed order: neither the number of threads nor their timing can show in a report.
 
 use super::ReproduceError;
+use super::parallel;
 use crate::lockstep::LockstepError;
 use crate::lockstep::in_process::InProcess;
 use crate::scenario::{self, Override, Scenario};
-use crate::world::{CompletedVisit, ZoneSummaryRow};
-use crossbeam::channel;
+use crate::world::{CompletedVisit, World, ZoneSummaryRow};
 use ipc_schemas::STATE_LEFT;
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -39,7 +39,7 @@ impl Run {
         run.record_visits();
         let failed =
             |error: LockstepError| ReproduceError::Run { command: self.command(), error: error.to_string() };
-        let complete = drive(&mut run, &scenario).map_err(failed)?;
+        let complete = drive(&mut run, &scenario, |_| {}).map_err(failed)?;
         let world = run.world();
         let mut zones = world.summary().zones;
         if !complete {
@@ -66,14 +66,20 @@ impl Run {
     }
 }
 
-/// Runs to the end, or until a zone is jammed; whether every vehicle got through.
-fn drive(run: &mut InProcess, scenario: &Scenario) -> Result<bool, LockstepError> {
+/// Runs to the end, or until a zone is jammed, and shows the world after each step; whether every vehicle got
+/// through.
+pub fn drive(
+    run: &mut InProcess,
+    scenario: &Scenario,
+    mut see: impl FnMut(&World),
+) -> Result<bool, LockstepError> {
     let window = ((JAM_S / scenario.dt_s()).ceil() as u64).max(1);
     let zones = scenario.network.zones.len();
     // Per zone: whether it had vehicles, and how many had left it, when the window began.
     let mut before = vec![(false, 0); zones];
     while run.step()? {
         let world = run.world();
+        see(world);
         if !world.step().is_multiple_of(window) {
             continue;
         }
@@ -154,33 +160,12 @@ impl Runs {
             .into_iter()
             .collect();
         self.total += missing.len();
-        let (give, take) = channel::unbounded::<&Run>();
-        let (report, results) = channel::unbounded();
-        for run in &missing {
-            give.send(run).expect("the receiving end is in scope");
-        }
-        drop(give);
         let mut finished = BTreeMap::new();
-        crossbeam::thread::scope(|scope| {
-            for _ in 0..self.jobs.min(missing.len()) {
-                let (take, report) = (take.clone(), report.clone());
-                scope.spawn(move |_| {
-                    for run in take {
-                        // Nobody listens any more once a run has failed.
-                        if report.send((run, run.execute())).is_err() {
-                            return;
-                        }
-                    }
-                });
-            }
-            drop(report);
-            for (run, outcome) in results {
-                finished.insert(run.clone(), outcome?);
-                progress(self.outcomes.len() + finished.len(), self.total);
-            }
-            Ok::<(), ReproduceError>(())
-        })
-        .unwrap_or_else(|panic| std::panic::resume_unwind(panic))?;
+        let (before, total) = (self.outcomes.len(), self.total);
+        parallel::each(self.jobs, &missing, Run::execute, |run, outcome| {
+            finished.insert(run.clone(), outcome);
+            progress(before + finished.len(), total);
+        })?;
         self.outcomes.append(&mut finished);
         Ok(())
     }

@@ -7,6 +7,7 @@ mod record;
 mod run;
 mod scenario;
 
+use crate::compare::cli::CompareArgs;
 use crate::reproduce::cli::ReproduceArgs;
 pub(super) use bench::{BenchArgs, BenchKind, PeerArgs, WaitBenchArgs};
 use clap::{Args, Parser, Subcommand};
@@ -54,6 +55,8 @@ pub(super) enum Command {
     Branch(BranchArgs),
     /// Regenerate the paper's tables and figures with intervals, verdicts and errata.
     Reproduce(ReproduceArgs),
+    /// Compare policies on the same arrivals: costs, safety, comfort, and how far they are from what is possible.
+    Compare(CompareArgs),
     /// Measure latency, the solver, scale, or waiting on this machine.
     Bench(BenchArgs),
     /// Remove the shared memory and files that crashed runs of yours have left; active runs are not touched.

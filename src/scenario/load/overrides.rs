@@ -8,7 +8,7 @@ use std::str::FromStr;
 /// One `--set key=value`.
 ///
 /// Keys are dotted. An element of an array of tables is addressed by its `name` or by its index from 0:
-/// `zones.merge-1.flow.terminal_mps`, `roads.0.demand.trace`. The value is TOML; what is not TOML is taken
+/// `zones.merge-1.flow.terminal_mps`, `roads.0.demand.trace`; `*` means all of them: `zones.*.flow`. The value is TOML; what is not TOML is taken
 /// as a string, so that `control.replan=from_state` needs no quotes. A whole table can be replaced by an
 /// inline table.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -54,12 +54,26 @@ impl Override {
         document.sets.push(self.text.clone());
         let value = parse_value(&self.value, origin)
             .unwrap_or_else(|_| Node { origin, value: Value::String(self.value.clone()) });
-        let mut node = &mut document.root;
-        for (depth, part) in self.path.iter().enumerate() {
-            node = self.step(node, depth, part, origin)?;
+        self.write(&mut document.root, 0, &value, origin)
+    }
+
+    /// Writes the value where the rest of the key leads from a node.
+    fn write(
+        &self,
+        node: &mut Node,
+        depth: usize,
+        value: &Node,
+        origin: Origin,
+    ) -> Result<(), ScenarioError> {
+        let Some(part) = self.path.get(depth) else {
+            *node = value.clone();
+            return Ok(());
+        };
+        if let (Value::Array(items), "*") = (&mut node.value, part.as_str()) {
+            return items.iter_mut().try_for_each(|item| self.write(item, depth + 1, value, origin));
         }
-        *node = value;
-        Ok(())
+        let child = self.step(node, depth, part, origin)?;
+        self.write(child, depth + 1, value, origin)
     }
 
     /// The child a part of the key leads to. Tables grow as needed: the schema tells later whether the key

@@ -1,0 +1,119 @@
+//! `cz compare`: arguments in, tables, files and a progress bar out.
+
+use super::cache::Cache;
+use super::report::{FORMAT, Report};
+use super::{CompareError, Comparison, Means, policy, run, tables};
+use clap::Args;
+use indicatif::{ProgressBar, ProgressStyle};
+use std::path::PathBuf;
+
+/// Arguments of `cz compare`.
+#[derive(Clone, Debug, Args)]
+#[command(after_help = after_help())]
+pub struct CompareArgs {
+    /// Policies, the first the one that the others are compared with
+    #[arg(required_unless_present = "table")]
+    pub policies: Vec<String>,
+    /// A comparison of docs/control.md in place of policies, scenario and seeds
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["policies", "scenario", "set"], value_parser = clap::builder::PossibleValuesParser::new(tables::names()))]
+    pub table: Option<String>,
+    /// Scenario: a TOML file, or an embedded one
+    #[arg(long, value_name = "S")]
+    pub scenario: Option<String>,
+    /// Seeds: how many, from 1, or a range as in 4-23; 20 by default
+    #[arg(long, value_name = "N|A-B")]
+    pub seeds: Option<Seeds>,
+    /// Change a scenario key under all policies; may be repeated
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub set: Vec<String>,
+    /// Seek the centralised optimum as well, where the network has merges only; takes minutes
+    #[arg(long)]
+    pub joint: bool,
+    /// Keep results of runs in this directory, and take from it what is there
+    #[arg(long, value_name = "DIR")]
+    pub cache: Option<PathBuf>,
+    /// Write compare.json, compare.md and Pareto plots (SVG, PNG) into this directory
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Write the JSON to standard output in place of the tables
+    #[arg(long)]
+    pub json: bool,
+    /// Threads; as many as there are cores by default. Results do not depend on it
+    #[arg(long, value_name = "J")]
+    pub jobs: Option<std::num::NonZeroUsize>,
+}
+
+/// Seeds of the replicates.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Seeds {
+    /// First.
+    pub from: u64,
+    /// Last.
+    pub to: u64,
+}
+
+impl Seeds {
+    /// All of them.
+    pub fn all(self) -> Vec<u64> {
+        (self.from..=self.to).collect()
+    }
+}
+
+/// More replicates than anybody waits for.
+const MOST: u64 = 100_000;
+
+impl std::str::FromStr for Seeds {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Seeds, String> {
+        let number = |text: &str| text.trim().parse::<u64>().ok();
+        let seeds = match text.split_once('-') {
+            Some((from, to)) => number(from).zip(number(to)),
+            None => number(text).map(|n| (1, n)),
+        };
+        let fits = |&(from, to): &(u64, u64)| from <= to && to - from < MOST;
+        let (from, to) = seeds
+            .filter(fits)
+            .ok_or_else(|| format!("expected a number from 1 to {MOST}, or a range such as 4-23"))?;
+        Ok(Seeds { from, to })
+    }
+}
+
+fn after_help() -> String {
+    format!("Policies: {}.\nTables: {}.", policy::known(), tables::names().collect::<Vec<_>>().join(", "))
+}
+
+/// Runs the command and returns what goes to standard output; a progress bar is on a terminal's standard error.
+pub fn main(args: &CompareArgs) -> Result<String, CompareError> {
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let cache = args.cache.as_deref().map_or(Ok(Cache::none()), Cache::at)?;
+    let means = Means { jobs: args.jobs.map_or(cores, usize::from), cache };
+    let comparisons = match &args.table {
+        Some(name) => tables::comparisons(name, args.seeds, args.joint),
+        None => vec![Comparison {
+            policies: args.policies.clone(),
+            scenario: args.scenario.clone(),
+            seeds: args.seeds.unwrap_or(Seeds { from: 1, to: 20 }).all(),
+            sets: args.set.clone(),
+            joint: args.joint,
+        }],
+    };
+    let bar = ProgressBar::new(0).with_style(
+        ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} runs, {elapsed} gone, {eta} to go")
+            .expect("the template is a constant"),
+    );
+    let mut blocks = Vec::new();
+    for comparison in &comparisons {
+        bar.set_message(comparison.scenario.clone().unwrap_or_default());
+        blocks.push(run(comparison, &means, &mut |done, total| {
+            bar.set_length(total as u64);
+            bar.set_position(done as u64);
+        })?);
+    }
+    bar.finish_and_clear();
+    let report = Report { format: FORMAT, blocks };
+    if let Some(directory) = &args.out {
+        report.write(directory)?;
+    }
+    Ok(if args.json { report.json() } else { report.terminal() })
+}
