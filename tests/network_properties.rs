@@ -2,9 +2,10 @@
 
 use control_zones::lockstep::{LockstepError, in_process::InProcess};
 use control_zones::scenario::{
-    Baseline, ControlParams, Demand, Downstream, Exit, FeConditions, FlowPolicy, LawKind, Network, Observed,
-    PassingOrder, Path, Poisson, PositionFeedback, RatePeriod, ReferenceLaw, Replan, Road, SafetyRows,
-    Scenario, Segment as Lane, Solver, Source, SpeedDistribution, VehicleKind, VehicleParams, Zone,
+    Baseline, ControlParams, Demand, Downstream, EntryRule, Exit, FeConditions, FlowPolicy, LawKind, Network,
+    Observed, PassingOrder, Path, Poisson, PositionFeedback, RatePeriod, ReferenceLaw, Replan, Road,
+    SafetyRows, Scenario, Segment as Lane, Solver, Source, SpeedDistribution, VehicleKind, VehicleParams,
+    ViableParams, Zone,
 };
 use control_zones::world::{World, WorldSummary};
 use ipc_schemas::{NO_ZONE, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState};
@@ -128,6 +129,7 @@ fn control() -> impl Strategy<Value = ControlParams> {
                 feasibility_rows,
                 fe_conditions: FeConditions::Full,
                 fe_fraction: 0.25,
+                viable: ViableParams::DEFAULT,
             }
         },
     )
@@ -164,6 +166,7 @@ fn network(raw: &[RawZone]) -> Network {
                     segment: at as u32,
                     demand: Demand::Poisson(zone.demands[at].clone()),
                     routes: Vec::new(),
+                    entry: EntryRule::default(),
                 });
                 Source::Road(road)
             });

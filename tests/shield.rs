@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)] // a test
 
 use control_zones::lockstep::in_process::InProcess;
-use control_zones::scenario::{Override, PassingOrder, Scenario, load};
+use control_zones::scenario::{EntryRule, Override, PassingOrder, Scenario, load};
 use control_zones::world::{ShieldRow, World};
 use ipc_schemas::{VehicleCommand, VehicleState};
 use std::sync::Arc;
@@ -141,6 +141,61 @@ fn withstands_them_in_a_tree_and_a_corridor() {
         withstands(network, always_u_max);
         withstands(network, leaders_that_stop);
     }
+}
+
+/// With a gate that lets in who is viable, approaches on which `v_max` can be braked off, and a standstill gap of a vehicle's
+/// length, nobody ever begins unsafe: no negative margin and no contact, for any controller (docs/control.md, T3).
+fn holds_for_everybody<A: FnMut(u64, &VehicleState) -> f64>(what: &str, adversary: impl Fn() -> A) {
+    for (network, steps) in [("two-merges", 400_000), ("corridor-8", 200_000), ("tree", 200_000)] {
+        let base = scenario(network, "on", 1.2, 600.0, 1);
+        let mut scenario = (*base).clone();
+        scenario.network.roads.iter_mut().for_each(|road| road.entry = EntryRule::Viable);
+        for kind in
+            std::iter::once(&mut scenario.vehicle).chain(scenario.fleet.iter_mut().map(|k| &mut k.vehicle))
+        {
+            kind.standstill_gap_m = kind.length_m;
+        }
+        let v = &scenario.vehicle;
+        let least_m =
+            v.v_max_mps * v.v_max_mps / (2.0 * -v.u_min_mps2) + 0.05 + v.v_max_mps * scenario.dt_s();
+        for path in scenario.network.zones.iter().flat_map(|zone| &zone.paths) {
+            assert!(path.length_m >= least_m, "{network}: {} m", path.length_m);
+        }
+        let (row, commanded, world) = attack(&Arc::new(scenario), steps, adversary());
+        let summary = world.summary();
+        println!(
+            "{what}, {network}: {commanded} vehicle-steps, {} bounded, {} held at the gate; {row:?}",
+            row.bounded, summary.held_arrivals
+        );
+        assert_eq!((row.began_unsafe, row.lost), (0, 0), "{what}, {network}");
+        assert_eq!(summary.overlaps.pairs, 0, "{what}, {network}: {:?}", summary.overlaps);
+        assert!(summary.held_arrivals > 0, "{what}, {network}");
+        for zone in &summary.zones {
+            for margin in [zone.min_rear_end_margin_m, zone.min_merge_margin_m] {
+                assert!(margin.is_none_or(|m| m >= 0.0), "{what}, {network}: {zone:?}");
+            }
+            assert_eq!(zone.mean_exposure_m_s, 0.0, "{what}, {network}");
+        }
+    }
+}
+
+/// Everybody speeds up wherever somebody else may be, and brakes where nobody is.
+fn contrary() -> impl FnMut(u64, &VehicleState) -> f64 {
+    |step, s| if (step / 40 + u64::from(s.vehicle)).is_multiple_of(2) || s.x_m > 150.0 { 4.0 } else { -4.0 }
+}
+
+/// All brake at once, and all let go at once, so that queues are packed as densely as they can be.
+fn waves() -> impl FnMut(u64, &VehicleState) -> f64 {
+    |step, s| if step % 300 < 60 && s.x_m < 150.0 { -4.0 } else { 4.0 }
+}
+
+#[test]
+fn a_gate_makes_it_hold_for_everybody() {
+    holds_for_everybody("full acceleration", always_u_max);
+    holds_for_everybody("random flips", random_flips);
+    holds_for_everybody("leaders that stop", leaders_that_stop);
+    holds_for_everybody("contrary", contrary);
+    holds_for_everybody("waves", waves);
 }
 
 /// An embedded scenario under another rate on every road, until the given number of vehicles has come.

@@ -87,6 +87,12 @@
 #define CZ_MODE_FE UINT16_C(1)
 /** `cz_vehicle_command_t.mode`: OCBF mode, tracking the reference. */
 #define CZ_MODE_OCBF UINT16_C(2)
+/** `cz_vehicle_command_t.mode`: law `viable`, on the way of its own optimum. */
+#define CZ_MODE_FREE UINT16_C(3)
+/** `cz_vehicle_command_t.mode`: law `viable`, on schedule. */
+#define CZ_MODE_SCHEDULED UINT16_C(4)
+/** `cz_vehicle_command_t.mode`: law `viable`, in a slot behind somebody. */
+#define CZ_MODE_SLOT UINT16_C(5)
 /** `cz_vehicle_command_t.verdict`: no row binds, the reference is tracked as wished. */
 #define CZ_VERDICT_NOMINAL UINT16_C(0)
 /** `cz_vehicle_command_t.verdict`: feasibility-enforcement mode decided the command. */
@@ -432,9 +438,11 @@ typedef struct cz_vehicle_command {
     /** Its zone. */
     uint32_t zone;
     /** Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4 rear end, 5
-     *  rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross feasibility. */
+     *  rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross feasibility, 10
+     *  comfort, 11 bodies. */
     uint32_t binding_rows;
-    /** Memory: 0 entered, 1 FE, 2 OCBF; other laws may have other modes. */
+    /** Memory: 0 entered, 1 FE, 2 OCBF, 3 free, 4 scheduled, 5 slot; other laws may have other
+     *  modes. */
     uint16_t mode;
     /** 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a deadline was
      *  missed, and refused from a controller: 4 held, 5 held within what the shield allows. */

@@ -12,6 +12,12 @@ codes! {
     pub const MODE_FE: u16 = 1;
     /// [`VehicleCommand::mode`]: OCBF mode, tracking the reference.
     pub const MODE_OCBF: u16 = 2;
+    /// [`VehicleCommand::mode`]: law `viable`, on the way of its own optimum.
+    pub const MODE_FREE: u16 = 3;
+    /// [`VehicleCommand::mode`]: law `viable`, on schedule.
+    pub const MODE_SCHEDULED: u16 = 4;
+    /// [`VehicleCommand::mode`]: law `viable`, in a slot behind somebody.
+    pub const MODE_SLOT: u16 = 5;
 
     /// [`VehicleCommand::verdict`]: no row binds, the reference is tracked as wished.
     pub const VERDICT_NOMINAL: u16 = 0;
@@ -65,9 +71,9 @@ record! {
         /// Its zone.
         pub zone: u32,
         /// Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4 rear end,
-        /// 5 rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross feasibility.
+        /// 5 rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross feasibility, 10 comfort, 11 bodies.
         pub binding_rows: u32,
-        /// Memory: 0 entered, 1 FE, 2 OCBF; other laws may have other modes.
+        /// Memory: 0 entered, 1 FE, 2 OCBF, 3 free, 4 scheduled, 5 slot; other laws may have other modes.
         pub mode: u16,
         /// 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a deadline was
         /// missed, and refused from a controller: 4 held, 5 held within what the shield allows.

@@ -85,7 +85,11 @@ impl Summary {
             state_hash: format!("{:016x}", world.state_hash),
             wall_s: outcome.wall_s,
             step_latency_us: outcome.step_latency_us,
-            total_objective: world.zones.iter().map(|z| z.mean_objective).sum(),
+            total_objective: world
+                .zones
+                .iter()
+                .map(|z| z.mean_objective + scenario.beta * z.mean_wait_s)
+                .sum(),
             zones: world.zones,
             arrived: world.arrived,
             departed: world.departed,
@@ -176,12 +180,14 @@ impl Summary {
         table.set_header([
             "zone",
             "vehicles",
+            "wait\n[s]",
             "time\n[s]",
             "energy\n[m²/s³]",
             "objective\n[m²/s³]",
             "FE\nvehicles",
             "FE time\n[s]",
             "infeasible\nvehicles",
+            "exposure\n[m s]",
             "rear-end margin\nall / entered safe [m]",
             "merge margin\nall / entered safe [m]",
         ]);
@@ -191,17 +197,20 @@ impl Summary {
             table.add_row([
                 zone.zone.clone(),
                 zone.vehicles.to_string(),
+                format!("{:.3}", zone.mean_wait_s),
                 format!("{:.3}", zone.mean_time_s),
                 format!("{:.3}", zone.mean_energy),
                 format!("{:.3}", zone.mean_objective),
                 zone.fe_vehicles.to_string(),
                 format!("{:.3}", zone.fe_mean_s),
                 zone.infeasible_vehicles.to_string(),
+                format!("{:.3}", zone.mean_exposure_m_s),
                 margins(zone.min_rear_end_margin_m, zone.min_rear_end_margin_clean_m),
                 margins(zone.min_merge_margin_m, zone.min_merge_margin_clean_m),
             ]);
         }
-        let mut total = vec![Cell::new("total"), Cell::new(self.departed), Cell::new(""), Cell::new("")];
+        let mut total = vec![Cell::new("total"), Cell::new(self.departed)];
+        total.extend(["", "", ""].map(Cell::new));
         total.push(Cell::new(format!("{:.3}", self.total_objective)));
         table.add_row(total);
         for column in table.column_iter_mut().skip(1) {
@@ -229,7 +238,7 @@ impl Summary {
         );
         if self.held_arrivals > 0 {
             text.push_str(&format!(
-                "{} arrivals had to wait outside; {} still waited at the end\n",
+                "{} arrivals had to wait outside, which counts as time in the total; {} still waited at the end\n",
                 self.held_arrivals, self.waiting
             ));
         }

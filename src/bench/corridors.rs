@@ -38,6 +38,7 @@ pub fn corridors(vehicles: usize, until_s: f64) -> Result<Scenario, ScenarioErro
                 zone: road.zone + i * zones_per,
                 segment: road.segment,
                 routes: Vec::new(),
+                entry: road.entry,
                 demand: Demand::Poisson(Poisson {
                     rates: vec![RatePeriod { until_s, vehicles_per_hour: 400.0 }],
                     min_headway_s: 2.0,

@@ -7,6 +7,7 @@
 use super::ocbf::Ocbf;
 use super::reference::Terminal;
 use super::rows::Row;
+use super::viable::Viable;
 use crate::conflict::DutyKind;
 use crate::scenario::{LawKind, Scenario};
 use ipc_schemas::MEMORY_WORDS;
@@ -144,6 +145,8 @@ pub trait Law {
 pub enum Laws {
     /// The paper's.
     Ocbf(Ocbf),
+    /// Slots within what is viable.
+    Viable(Viable),
 }
 
 impl Laws {
@@ -151,6 +154,7 @@ impl Laws {
     pub fn of(scenario: &Scenario, kind: LawKind) -> Laws {
         match kind {
             LawKind::Ocbf => Laws::Ocbf(Ocbf::new(scenario)),
+            LawKind::Viable => Laws::Viable(Viable::new(scenario)),
         }
     }
 }

@@ -239,6 +239,7 @@ impl ControllerPool {
     ) -> Result<(), PoolError> {
         self.visit(time_s, states, |laws, scene| match laws {
             Laws::Ocbf(law) => scene.decide(law, &mut emit),
+            Laws::Viable(law) => scene.decide(law, &mut emit),
         })
     }
 
@@ -255,6 +256,7 @@ impl ControllerPool {
                     show(&program, rows);
                 }
             }),
+            Laws::Viable(_) => {}
         })
     }
 

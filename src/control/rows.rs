@@ -33,11 +33,15 @@ pub enum Row {
     Cross = 1 << 8,
     /// Its feasibility row.
     CrossFeasibility = 1 << 9,
+    /// Comfort toward a leader (law `viable`).
+    Comfort = 1 << 10,
+    /// Nobody drives through anybody: the second tier of law `viable`.
+    Bodies = 1 << 11,
 }
 
 impl Row {
     /// All rows, in bit order.
-    pub const ALL: [Row; 10] = [
+    pub const ALL: [Row; 12] = [
         Row::UMin,
         Row::UMax,
         Row::VMin,
@@ -48,6 +52,8 @@ impl Row {
         Row::MergeFeasibility,
         Row::Cross,
         Row::CrossFeasibility,
+        Row::Comfort,
+        Row::Bodies,
     ];
 
     /// Short name for tables and messages.
@@ -63,6 +69,8 @@ impl Row {
             Row::MergeFeasibility => "merge feasibility",
             Row::Cross => "cross",
             Row::CrossFeasibility => "cross feasibility",
+            Row::Comfort => "comfort",
+            Row::Bodies => "bodies",
         }
     }
 }

@@ -29,6 +29,9 @@ pub fn mode(command: &VehicleCommand) -> String {
         frames::MODE_ENTERED => "entered".to_owned(),
         frames::MODE_FE => "FE".to_owned(),
         frames::MODE_OCBF => "OCBF".to_owned(),
+        frames::MODE_FREE => "free".to_owned(),
+        frames::MODE_SCHEDULED => "scheduled".to_owned(),
+        frames::MODE_SLOT => "slot".to_owned(),
         other => other.to_string(),
     }
 }

@@ -111,6 +111,7 @@ fn round(value: f64, per_unit: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scenario::EntryRule;
 
     fn poisson(rates: &[(f64, f64)], min_headway_s: f64) -> Road {
         let rates = rates
@@ -119,7 +120,7 @@ mod tests {
             .collect();
         let speed = SpeedDistribution { mean_mps: 16.0, sd_mps: 1.2, min_mps: 14.0, max_mps: 17.5 };
         let demand = Demand::Poisson(Poisson { rates, min_headway_s, speed });
-        Road { name: "r".into(), zone: 0, segment: 0, demand, routes: Vec::new() }
+        Road { name: "r".into(), zone: 0, segment: 0, demand, routes: Vec::new(), entry: EntryRule::Free }
     }
 
     fn arrivals(road: &Road, index: u32, seed: u64) -> Vec<Arrival> {

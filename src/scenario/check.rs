@@ -57,6 +57,13 @@ impl Scenario {
             within(what, gain, &ranges::GAIN)?;
         }
         within("slack_weight", control.slack_weight, &ranges::SLACK_WEIGHT)?;
+        let viable = &control.viable;
+        within("k_comfort_per_s", viable.k_comfort_per_s, &ranges::GAIN)?;
+        within("k_recovery_per_s", viable.k_recovery_per_s, &ranges::GAIN)?;
+        within("clearance_m", viable.clearance_m, &ranges::STANDSTILL_GAP)?;
+        within("buffer_m", viable.buffer_m, &ranges::STANDSTILL_GAP)?;
+        within("buffer_s", viable.buffer_s, &ranges::REACTION_TIME)?;
+        within("passage_weight", viable.passage_weight, &ranges::SHARE)?;
         number("fe_fraction", control.fe_fraction, |f| f > 0.0 && f <= 1.0)?;
         network(&self.network, self.vehicle.v_max_mps * dt_s, self.vehicle.v_max_mps)?;
         for exit in self.network.zones.iter().flat_map(|zone| &zone.exits) {

@@ -19,7 +19,7 @@ mod topology;
 pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;
 
-use super::{LawKind, Network, Road, Scenario, ShieldMode, embedded, ranges};
+use super::{EntryRule, LawKind, Network, Road, Scenario, ShieldMode, embedded, ranges};
 use demand::{DemandReader, TraceBase};
 pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
@@ -156,6 +156,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         "vehicle",
         "objective",
         "control",
+        "gate",
         "shield",
         "fleet",
         "roads",
@@ -182,7 +183,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let road_tables = root.tables("roads", "a list of entry roads, at least one")?;
     let zone_tables = root.tables("zones", "a list of zones, at least one")?;
     for table in &road_tables {
-        table.only(&["name", "demand", "routes"])?;
+        table.only(&["name", "demand", "routes", "entry"])?;
     }
     for table in &zone_tables {
         table.only(&topology::ZONE_KEYS)?;
@@ -206,12 +207,18 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let routes = routes.map(|(table, &end)| routes::read(table, &topology.zones, end));
     let routes = routes.collect::<Result<Vec<_>, _>>()?;
     let mut reader = DemandReader { base, seed, roads: road_names, routes, vehicle, traces: BTreeMap::new() };
+    let gate = section("gate")?;
+    if let Some(table) = &gate {
+        table.only(&["entry"])?;
+    }
+    let entry_everywhere = sections::entry(gate.as_ref(), EntryRule::default())?;
     let mut roads = Vec::with_capacity(road_tables.len());
     for (index, (table, &(zone, segment))) in road_tables.iter().zip(&topology.road_ends).enumerate() {
         let demand = reader.read(index as u32, table)?;
         let name = reader.roads[index].to_owned();
         let routes = std::mem::take(&mut reader.routes[index]);
-        roads.push(Road { name, zone, segment, demand, routes });
+        let entry = sections::entry(Some(table), entry_everywhere)?;
+        roads.push(Road { name, zone, segment, demand, routes, entry });
     }
     let plugins = plugins::read(&root, &topology.zones)?;
     let shield = root.choice_or_first(

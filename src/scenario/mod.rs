@@ -31,12 +31,12 @@ pub use load::{
     load_recorded, text_of,
 };
 pub use network::{
-    Crossing, Downstream, Exit, LawKind, Network, PassingOrder, Path, Road, Route, Segment, Source, Zone,
-    ZoneId,
+    Crossing, Downstream, EntryRule, Exit, LawKind, Network, PassingOrder, Path, Road, Route, Segment,
+    Source, Zone, ZoneId,
 };
 pub use params::{
     Baseline, ControlParams, FeConditions, FlowPolicy, Observed, PositionFeedback, ReferenceLaw, Replan,
-    SafetyRows, Solver, VehicleKind, VehicleParams,
+    SafetyRows, Solver, VehicleKind, VehicleParams, ViableParams,
 };
 pub use plugins::{ControllerNames, Drivers, Plugin, ShieldMode};
 

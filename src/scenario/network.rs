@@ -131,6 +131,21 @@ pub enum LawKind {
     /// Optimal control tracked under control barrier functions, as in the paper.
     #[default]
     Ocbf,
+    /// Plans for slots, within what is viable.
+    Viable,
+}
+
+/// When an arrival may enter behind the last vehicle on its road.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum EntryRule {
+    /// As soon as it overlaps nobody.
+    #[default]
+    Free,
+    /// Once it is viable toward it: it keeps the distances it owes, whatever that one does.
+    Viable,
+    /// Once it can stop behind it, whatever that one does.
+    RoomToStop,
 }
 
 /// An entry road.
@@ -146,6 +161,8 @@ pub struct Road {
     pub demand: Demand,
     /// Ways its vehicles may take, with weights; empty when paths are drawn zone by zone.
     pub routes: Vec<Route>,
+    /// When they may enter.
+    pub entry: EntryRule,
 }
 
 /// The paths a vehicle takes from zone to zone; behind the last one paths are drawn.

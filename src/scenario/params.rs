@@ -125,6 +125,49 @@ pub struct ControlParams {
     pub fe_conditions: FeConditions,
     /// Fraction of the approach within which FE mode may act (paper: L/4).
     pub fe_fraction: f64,
+    /// What concerns the law `viable` alone.
+    pub viable: ViableParams,
+}
+
+/// The law `viable` (docs/control.md); each of its parts can be switched off alone, to see what it contributes.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ViableParams {
+    /// Whether accelerations are bounded by what is viable: the first tier.
+    pub viability: bool,
+    /// Whether there is the comfort row toward leaders.
+    pub comfort: bool,
+    /// Whether there is the second tier: nobody drives through anybody.
+    pub bodies: bool,
+    /// Whether slots behind partners are kept.
+    pub slots: bool,
+    /// Gain of the comfort row, 1/s.
+    pub k_comfort_per_s: f64,
+    /// The same where the margin is negative, 1/s.
+    pub k_recovery_per_s: f64,
+    /// Distance between bodies that the second tier keeps, m.
+    pub clearance_m: f64,
+    /// Distance added to a slot, m,
+    pub buffer_m: f64,
+    /// in proportion to the time to go where that is less than this, s.
+    pub buffer_s: f64,
+    /// How many others' time counts when a slow passage holds up those behind.
+    pub passage_weight: f64,
+}
+
+impl ViableParams {
+    /// What holds when a scenario says nothing.
+    pub const DEFAULT: ViableParams = ViableParams {
+        viability: true,
+        comfort: true,
+        bodies: true,
+        slots: true,
+        k_comfort_per_s: 1.0,
+        k_recovery_per_s: 1.5,
+        clearance_m: 1.0,
+        buffer_m: 0.3,
+        buffer_s: 3.0,
+        passage_weight: 10.0,
+    };
 }
 
 /// Baseline speed v_b of a feedback policy.

@@ -64,12 +64,28 @@ pub struct Projection {
 /// Slack below which the shield leaves a vehicle no choice but `u_min`, m. Braking at `u_min` keeps the
 /// slack constant but for rounding (some 1e-14 m a step), so this absorbs 10^4 steps of it.
 pub const RESERVE_M: f64 = 1e-9;
+/// Slack from which a state is viable, m. Whoever is driven along the edge has the reserve left but for rounding, and is
+/// viable still when it passes into the next zone.
+pub const VIABLE_FROM_M: f64 = 0.5 * RESERVE_M;
 /// What a speed may exceed the greatest one by, m/s: rounding.
 const RESERVE_MPS: f64 = 1e-9;
 /// Crossing speeds are taken to be at least this, m/s.
 const LEAST_CROSSING_MPS: f64 = 1e-3;
 /// Halvings of the bracket `[u_min, wish]`: to the last bits of a double.
 const HALVINGS: u32 = 52;
+
+/// A step of a vehicle from end to end, for conditions that need no more.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ends {
+    x0_m: f64,
+    v0_mps: f64,
+    x1_m: f64,
+    v1_mps: f64,
+    /// Where full braking would stop it afterwards, m.
+    stops_m: f64,
+    /// What a margin may be less within the step than at its ends, m.
+    dip_m: f64,
+}
 
 /// The shield of one kind of vehicle.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -90,6 +106,11 @@ impl Shield {
             reaction_s: vehicle.reaction_time_s,
             dt_s,
         }
+    }
+
+    /// The shield of bodies alone: without reaction time, so that what is kept is the gap.
+    pub fn of_bodies(vehicle: &VehicleParams, dt_s: f64) -> Shield {
+        Shield { reaction_s: 0.0, ..Shield::new(vehicle, dt_s) }
     }
 
     /// How far the state is inside the set that is safe toward a leader, m; negative outside.
@@ -156,6 +177,12 @@ impl Shield {
         self.slack_of(x_m, v_mps, partner, 0.0)
     }
 
+    /// Whether a state is viable toward a partner at the beginning of its motion: full braking keeps what is owed, whatever
+    /// the partner does.
+    pub fn is_viable(&self, x_m: f64, v_mps: f64, partner: &Partner) -> bool {
+        self.state_slack_m(x_m, v_mps, partner) >= VIABLE_FROM_M
+    }
+
     /// The slack at the end of a step driven with `own`, m.
     pub fn slack_after_m(&self, own: &Held, partner: &Partner) -> f64 {
         self.slack_of(own.position_m(self.dt_s), own.speed_mps(self.dt_s), partner, self.dt_s)
@@ -190,6 +217,42 @@ impl Shield {
         }
         let later = |held: &Held| Held::new(held.position_m(after_s), held.speed_mps(after_s), held.u_mps2);
         later(own).least_margin_m(&later(motion), 0.0, self.reaction_s, *gap_m, self.dt_s - after_s)
+    }
+
+    /// The ends of a step driven with an acceleration.
+    #[inline]
+    pub fn ends(&self, x_m: f64, v_mps: f64, u_mps2: f64) -> Ends {
+        let (b, dt) = (self.braking_mps2, self.dt_s);
+        let end_mps = v_mps + u_mps2 * dt;
+        // A vehicle that stops within the step gets no further than with the speed it began with.
+        let mean_mps = if end_mps > 0.0 { v_mps + 0.5 * u_mps2 * dt } else { v_mps };
+        let (x1_m, v1_mps) = (x_m + mean_mps * dt, end_mps.max(0.0));
+        let stops_m = x1_m + v1_mps * v1_mps / (2.0 * b);
+        Ends { x0_m: x_m, v0_mps: v_mps, x1_m, v1_mps, stops_m, dip_m: 0.125 * (u_mps2.abs() + b) * dt * dt }
+    }
+
+    /// Whether a step is admissible toward a partner at `(x_m, v_mps)` that brakes fully, by a wide berth: what most steps keep,
+    /// and takes no root and no division to see. Who does not keep it may still be admissible.
+    #[inline]
+    pub fn plainly_admits(&self, own: &Ends, kind: DutyKind, at_m: f64, other: &Seen) -> bool {
+        if kind != DutyKind::RearEnd && own.x1_m < at_m {
+            // It can stop before the point.
+            return own.stops_m + 2.0 * RESERVE_M <= at_m;
+        }
+        let (b, dt) = (self.braking_mps2, self.dt_s);
+        if kind == DutyKind::Cross || own.x0_m < at_m && kind == DutyKind::Merge || other.braking_mps2 != b {
+            return false;
+        }
+        // No further than this while it brakes, and no faster.
+        let (y1_m, w1_mps) = (other.x_m + (other.v_mps - 0.5 * b * dt) * dt, (other.v_mps - b * dt).max(0.0));
+        let before_m = other.x_m - own.x0_m - self.reaction_s * own.v0_mps - other.gap_m;
+        let after_m = y1_m - own.x1_m - self.reaction_s * own.v1_mps - other.gap_m;
+        let shed = (own.v1_mps - self.reaction_s * b).max(0.0);
+        let berth_m = own.dip_m + 2.0 * RESERVE_M;
+        // The slack is the margin less what speed takes; times 2 B, so that nothing is divided.
+        before_m >= berth_m
+            && after_m >= berth_m
+            && 2.0 * b * (after_m - berth_m) >= shed * shed - w1_mps * w1_mps
     }
 
     /// Whether the step may be driven so: its end is safe, and the margin has not been negative, nor less

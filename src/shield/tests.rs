@@ -32,6 +32,20 @@ fn partner((kind, braking_mps2): (DutyKind, f64), x: f64, v: f64, u: f64) -> Par
     Partner { kind, at_m: 200.0, gap_m: 0.5, braking_mps2, motion: Held::new(x, v, u.max(-braking_mps2)) }
 }
 
+#[test]
+fn who_has_room_is_plainly_admitted() {
+    let shield = Shield::new(&VEHICLE, 0.1);
+    let seen = |x_m| Seen { x_m, v_mps: 15.0, gap_m: 0.5, braking_mps2: 4.0 };
+    let plain =
+        |u, kind, at_m, x_m| shield.plainly_admits(&shield.ends(0.0, 15.0, u), kind, at_m, &seen(x_m));
+    assert!(plain(1.0, DutyKind::RearEnd, 0.0, 32.0));
+    assert!(!plain(1.0, DutyKind::RearEnd, 0.0, 27.0));
+    for kind in [DutyKind::Merge, DutyKind::Cross] {
+        assert!(plain(1.0, kind, 40.0, -100.0));
+        assert!(!plain(1.0, kind, 28.0, -100.0));
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 4000, max_global_rejects: 100_000, ..ProptestConfig::default() })]
 
@@ -60,6 +74,19 @@ proptest! {
         let own = Held::new(x, v, -4.0);
         prop_assert!(shield.slack_after_m(&own, &partner) >= -1e-9);
         prop_assert!(shield.least_margin_m(&own, &partner) >= -1e-9);
+    }
+
+    /// What is plainly admissible is admissible.
+    #[test]
+    fn what_is_plainly_admitted_is_admitted(
+        (owed, x, v, ahead, w, u) in scenes(), dt in 0.01..2.0f64,
+    ) {
+        let shield = Shield::new(&VEHICLE, dt);
+        let partner = partner(owed, x + ahead, w, f64::NEG_INFINITY);
+        let seen = Seen { x_m: x + ahead, v_mps: w, gap_m: 0.5, braking_mps2: owed.1 };
+        let plain = shield.plainly_admits(&shield.ends(x, v, u), owed.0, 200.0, &seen);
+        let admits = shield.admits(&Held::new(x, v, u), &partner);
+        prop_assert!(admits || !plain);
     }
 
     /// Less acceleration is never less safe: what makes the projection one number.

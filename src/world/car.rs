@@ -58,6 +58,10 @@ pub(super) struct Beyond {
 pub(super) struct Visit {
     pub energy: f64,
     pub fe_s: f64,
+    /// Time it waited outside before it entered, s.
+    pub wait_s: f64,
+    /// Integral over time of what its rear-end margin lacks, m s.
+    pub exposure_m_s: f64,
     pub least_rear_end_m: f64,
     pub least_merge_m: f64,
     pub least_cross_m: f64,
@@ -68,7 +72,8 @@ pub(super) struct Visit {
     pub infeasible: bool,
     /// Whether the command in force was no number or beyond the limits as it came.
     pub beyond: bool,
-    /// Whether all rear-end (merging) entry conditions held at the first sample in the zone.
+    /// Whether it was viable toward each leader (each vehicle that passes a point before it) when it came to owe it
+    /// something.
     pub clean_rear_end: bool,
     pub clean_merge: bool,
 }
@@ -77,6 +82,8 @@ impl Visit {
     pub(super) const NEW: Visit = Visit {
         energy: 0.0,
         fe_s: 0.0,
+        wait_s: 0.0,
+        exposure_m_s: 0.0,
         least_rear_end_m: f64::INFINITY,
         least_merge_m: f64::INFINITY,
         least_cross_m: f64::INFINITY,

@@ -1,7 +1,8 @@
 //! Entry roads: who arrives when, and who has to wait outside.
 
 use crate::scenario::arrivals::ArrivalStream;
-use crate::scenario::{Arrival, Circles, Road, Scenario, ZoneId};
+use crate::scenario::{Arrival, Circles, EntryRule, Road, Scenario, VehicleParams, ZoneId};
+use crate::shield::{RESERVE_M, Seen, Shield};
 use crate::vehicle::Held;
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
@@ -126,6 +127,42 @@ impl Gates {
     pub(super) fn exhausted(&self) -> bool {
         (self.left_to_generate == 0 || self.next.is_empty()) && self.queues.is_empty()
     }
+}
+
+/// A newcomer at the first sample after it would enter.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Newcomer<'a> {
+    pub own: &'a VehicleParams,
+    pub x_m: f64,
+    pub v_mps: f64,
+}
+
+/// Whether a road's gate lets a newcomer in behind `leader`, whose parameters are `other`; `reference` are those for which
+/// standstill gaps are stated, `clearance_m` what is kept between bodies that stop.
+pub(super) fn admits(
+    rule: EntryRule,
+    newcomer: Newcomer<'_>,
+    (leader, other): (&Held, &VehicleParams),
+    reference: &VehicleParams,
+    clearance_m: f64,
+    dt_s: f64,
+) -> bool {
+    let Newcomer { own, x_m, v_mps } = newcomer;
+    let (shield, gap_m) = match rule {
+        EntryRule::Free => return true,
+        EntryRule::Viable => {
+            let extra_m = (other.length_m - reference.length_m).max(0.0);
+            (Shield::new(own, dt_s), own.standstill_gap_m + extra_m)
+        }
+        EntryRule::RoomToStop => (Shield::of_bodies(own, dt_s), other.length_m + clearance_m),
+    };
+    let seen = Seen {
+        x_m: leader.position_m(dt_s),
+        v_mps: leader.speed_mps(dt_s),
+        gap_m,
+        braking_mps2: -other.u_min_mps2,
+    };
+    shield.slack_m(x_m, v_mps, seen) >= RESERVE_M
 }
 
 /// Whether a vehicle may enter at speed `v_mps` behind `leader`, `after_s` into the step, without

@@ -9,12 +9,12 @@ use super::car::{Beyond, Car};
 use super::faults::Limits;
 use super::link::LinkCar;
 use super::metrics::{ShieldRow, ShieldSummary};
-use super::owed::{Owed, Standing};
+use super::owed::Standing;
 use super::role::World;
 use crate::conflict::DutyKind;
 use crate::lanes::AHEAD;
-use crate::scenario::{Drivers, Scenario, ShieldMode, VehicleParams};
-use crate::shield::{Partner, RESERVE_M, Row, Shield};
+use crate::scenario::{Drivers, Scenario, ShieldMode};
+use crate::shield::{Partner, Row, Shield};
 use crate::vehicle::Held;
 use ipc_schemas::{self as frames, VehicleCommand};
 use std::collections::HashMap;
@@ -128,7 +128,7 @@ const EXIT_MPS2: f64 = 2.0;
 pub(super) struct Gateway {
     mode: ShieldMode,
     /// By kind of vehicle.
-    shields: Vec<Shield>,
+    pub(super) shields: Vec<Shield>,
     drivers: Drivers,
     rows: Vec<ShieldRow>,
     /// The partners of one vehicle, and which of its duties each belongs to; kept for its allocation.
@@ -466,12 +466,10 @@ impl World {
             partners.clear();
             for (at, owed) in owed[car.owed.0 as usize..car.owed.1 as usize].iter_mut().enumerate() {
                 let other = &cars[owed.duty.partner as usize];
-                let Some(partner) = partner(owed, &car, other, &self.kinds) else { continue };
+                let Some(partner) = owed.partner(&car, other, &self.kinds) else { continue };
                 // Judged when the vehicle comes to owe this partner something, and held to it from then on.
                 if owed.standing == Standing::Unknown {
-                    let safe = shield.state_slack_m(car.x_m, car.v_mps, &partner) >= RESERVE_M;
-                    owed.standing = if safe { Standing::Safe } else { Standing::Unsafe };
-                    row.began_unsafe += u32::from(!safe);
+                    row.began_unsafe += u32::from(owed.judge(shield, &car, other, &self.kinds));
                 }
                 partners.push((partner, at));
             }
@@ -556,17 +554,4 @@ pub(super) struct Followed {
     pub u_mps2: f64,
     /// Whether that is settled when the zone it left is about to be.
     is_settled: bool,
-}
-
-/// A partner as the shield sees it, while something is owed to it.
-fn partner(owed: &Owed, car: &Car, other: &Car, kinds: &[VehicleParams]) -> Option<Partner> {
-    let duty = &owed.duty;
-    let kind = duty.in_force(car.x_m, other.x_m)?;
-    Some(Partner {
-        kind,
-        at_m: duty.own_m,
-        gap_m: duty.gap_m,
-        braking_mps2: -kinds[usize::from(other.kind)].u_min_mps2,
-        motion: Held::new(other.x_m + duty.shift_m(), other.v_mps, other.command_mps2),
-    })
 }

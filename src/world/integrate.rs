@@ -1,16 +1,16 @@
 //! One step of the world: exact motion, exact crossing instants, cost and margin accounting.
 
-use super::car::{Beyond, Car, Visit};
-use super::gate::{Queue, Waiting, may_enter};
+use super::car::{Beyond, Car};
+use super::gate::{Newcomer, Queue, Waiting, admits, may_enter};
 use super::link::{Link, LinkCar};
 use super::metrics::CompletedVisit;
-use super::owed::Owed;
+use super::owed::{Owed, Standing};
 use super::role::{Scratch, World};
 use super::way::Ways;
 use crate::conflict::DutyKind;
 use crate::lanes::AHEAD;
-use crate::scenario::{Downstream, Scenario, VehicleParams, ZoneId};
-use crate::vehicle::{Held, Merge, Pair, RearEnd};
+use crate::scenario::{Downstream, EntryRule, Road, Scenario, ZoneId};
+use crate::vehicle::Held;
 use ipc_schemas::{VERDICT_FE, VERDICT_INFEASIBLE};
 
 /// A vehicle about to enter a zone at the end of the step.
@@ -57,7 +57,7 @@ impl World {
             if alone {
                 self.hold_left(&scenario, zone, false);
             }
-            let crosses = self.look(&scenario, zone, dt_s);
+            let crosses = self.look(zone, dt_s);
             self.observe_overlaps(&scenario, zone, dt_s);
             self.zones[zone].left_now = crosses;
             if crosses {
@@ -87,11 +87,11 @@ impl World {
         self.enter();
     }
 
-    /// Works out the motions of a zone's cars, updates the least margins over the step, and notes, for vehicles
-    /// seen for the first time, whether their entry conditions hold. Returns whether a vehicle leaves the zone.
-    fn look(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) -> bool {
+    /// Works out the motions of a zone's cars, updates the least margins over the step, and judges, when a vehicle
+    /// comes to owe somebody something, whether it is viable toward it. Returns whether a vehicle leaves the zone.
+    fn look(&mut self, zone: usize, dt_s: f64) -> bool {
         let lengths_m = &self.lengths_m[zone];
-        let owed = &self.owed[zone];
+        let owed = &mut self.owed[zone];
         let metrics = &mut self.metrics[zone];
         let motions = &mut self.scratch.motions;
         let cars = &mut self.cars[zone];
@@ -100,7 +100,7 @@ impl World {
         motions.extend(cars.iter().map(Car::held));
         for i in self.zones[zone].first()..cars.len() {
             let (car, held) = (cars[i], &motions[i]);
-            let owed = &owed[car.owed.0 as usize..car.owed.1 as usize];
+            let owed = &mut owed[car.owed.0 as usize..car.owed.1 as usize];
             let own = &self.kinds[usize::from(car.kind)];
             let mut visit = car.visit;
             match visit.verdict {
@@ -108,20 +108,29 @@ impl World {
                 VERDICT_INFEASIBLE => visit.infeasible = true,
                 _ => {}
             }
-            if visit.entered {
-                note_entry_conditions(scenario, own, &car, owed, cars, &mut visit);
-            }
             let after_s = held.passes_m(lengths_m[car.path as usize], dt_s);
             leaves |= after_s.is_some();
-            for Owed { duty, .. } in owed {
-                let other = &cars[duty.partner as usize];
+            let mut lacks_m = 0.0_f64;
+            for owed in owed {
+                let other = &cars[owed.duty.partner as usize];
+                if owed.standing == Standing::Unknown {
+                    owed.judge(&self.gateway.shields[usize::from(car.kind)], &car, other, &self.kinds);
+                }
+                let Owed { duty, standing, .. } = &*owed;
                 let Some(kind) = duty.in_force(car.x_m, other.x_m) else { continue };
+                let is_clean = match kind {
+                    DutyKind::RearEnd => &mut visit.clean_rear_end,
+                    DutyKind::Merge | DutyKind::Cross => &mut visit.clean_merge,
+                };
+                *is_clean &= *standing != Standing::Unsafe;
                 let motion = &motions[duty.partner as usize];
                 if kind == DutyKind::RearEnd {
                     let end_s = after_s.unwrap_or(dt_s);
                     let (phi, shift_m) = (own.reaction_time_s, duty.shift_m());
                     let margin = held.least_margin_m(motion, shift_m, phi, duty.gap_m, end_s);
                     visit.least_rear_end_m = visit.least_rear_end_m.min(margin);
+                    let now_m = other.x_m + shift_m - car.x_m - phi * car.v_mps - duty.gap_m;
+                    lacks_m = lacks_m.max(-now_m);
                     metrics.overtakes += u32::from(other.x_m + shift_m < car.x_m);
                     continue;
                 }
@@ -136,6 +145,9 @@ impl World {
                     if kind == DutyKind::Merge { &mut visit.least_merge_m } else { &mut visit.least_cross_m };
                 *least = least.min(margin);
             }
+            // By trapezoids: the first sample counts for half a step.
+            let counts_s = if visit.entered { 0.5 * dt_s } else { after_s.unwrap_or(dt_s) };
+            visit.exposure_m_s += lacks_m * counts_s;
             cars[i].visit = visit;
         }
         leaves
@@ -173,6 +185,8 @@ impl World {
                     exit_speed_mps: held.speed_mps(after_s),
                     energy: visit.energy,
                     fe_s: visit.fe_s,
+                    wait_s: visit.wait_s,
+                    exposure_m_s: visit.exposure_m_s,
                 });
             }
             let to = shape.exits[exit as usize].to;
@@ -260,7 +274,8 @@ impl World {
         // Vehicles are numbered in order of road.
         self.scratch.leaders.sort_unstable_by_key(|leader| leader.road);
         for &Leader { road, motion: mut leader } in &self.scratch.leaders {
-            let zone = scenario.network.roads[road as usize].zone;
+            let Road { zone, entry, .. } = scenario.network.roads[road as usize];
+            let (reference, clearance_m) = (&scenario.vehicle, scenario.control.viable.clearance_m);
             while let Some(&Waiting { arrival, held }) = self.gates.waiting[road as usize].front() {
                 let id = self.arrived;
                 let way = ways.at_road(road, id, arrival.route);
@@ -271,11 +286,17 @@ impl World {
                 let mut after_s = (arrival.time_s - now_s).min(dt_s);
                 if held {
                     after_s = dt_s;
-                    speed_mps = leader.map_or(speed_mps, |(l, _)| speed_mps.min(l.speed_mps(dt_s)));
+                    // Where a gate waits for distance, nobody has to enter as slowly as the one ahead.
+                    if entry == EntryRule::Free {
+                        speed_mps = leader.map_or(speed_mps, |(l, _)| speed_mps.min(l.speed_mps(dt_s)));
+                    }
                 }
+                let newcomer = Newcomer { own, x_m: speed_mps * (dt_s - after_s), v_mps: speed_mps };
                 let free = leader.is_none_or(|(motion, kind): (Held, u16)| {
-                    let gap_m = self.kinds[usize::from(kind)].length_m + own.standstill_gap_m;
+                    let other = &self.kinds[usize::from(kind)];
+                    let gap_m = other.length_m + own.standstill_gap_m;
                     may_enter(&motion, after_s, speed_mps, gap_m, own.u_min_mps2, dt_s)
+                        && admits(entry, newcomer, (&motion, other), reference, clearance_m, dt_s)
                 });
                 let has_room = self.gates.have_room(zone, way.path);
                 let waiting_here = &mut self.gates.waiting[road as usize];
@@ -291,6 +312,7 @@ impl World {
                 self.gates.pass(None, Some((zone, way.path)));
                 self.arrived += 1;
                 let mut car = Car::arriving(id, way, kind, now_s + after_s, speed_mps);
+                car.visit.wait_s = now_s + after_s - arrival.time_s;
                 let held = Held::new(-speed_mps * after_s, speed_mps, 0.0);
                 car.x_m = held.position_m(dt_s);
                 self.scratch.entries.push(Entry { zone, car });
@@ -334,47 +356,5 @@ impl World {
         }
         self.events.sort_unstable();
         self.events.dedup();
-    }
-}
-
-fn note_entry_conditions(
-    scenario: &Scenario,
-    own: &VehicleParams,
-    car: &Car,
-    owed: &[Owed],
-    cars: &[Car],
-    visit: &mut Visit,
-) {
-    let control = &scenario.control;
-    for Owed { duty, .. } in owed {
-        let other = &cars[duty.partner as usize];
-        let pair = Pair {
-            x_m: car.x_m,
-            v_mps: car.v_mps,
-            partner_x_m: other.x_m + duty.shift_m(),
-            partner_v_mps: other.v_mps,
-            partner_u_mps2: other.u_mps2,
-        };
-        match duty.in_force(car.x_m, other.x_m) {
-            None => {}
-            Some(DutyKind::RearEnd) => {
-                let rear_end = RearEnd {
-                    reaction_s: own.reaction_time_s,
-                    gap_m: duty.gap_m,
-                    k_per_s: control.k_rear_end_per_s,
-                    u_min_mps2: own.u_min_mps2,
-                };
-                visit.clean_rear_end &= rear_end.may_be_tracked(&pair);
-            }
-            Some(DutyKind::Merge | DutyKind::Cross) => {
-                let merge = Merge {
-                    reaction_per_length: own.reaction_time_s / duty.own_m,
-                    gap_m: duty.gap_m,
-                    k_per_s: control.k_merge_per_s,
-                    u_min_mps2: own.u_min_mps2,
-                };
-                visit.clean_merge &= merge.may_be_tracked(&pair);
-            }
-        }
     }
 }

@@ -12,6 +12,8 @@ pub(super) struct ZoneMetrics {
     pub vehicles: u32,
     pub time_s: f64,
     pub energy: f64,
+    pub wait_s: f64,
+    pub exposure_m_s: f64,
     pub fe_vehicles: u32,
     pub fe_s: f64,
     pub infeasible_vehicles: u32,
@@ -30,6 +32,8 @@ impl Default for ZoneMetrics {
             vehicles: 0,
             time_s: 0.0,
             energy: 0.0,
+            wait_s: 0.0,
+            exposure_m_s: 0.0,
             fe_vehicles: 0,
             fe_s: 0.0,
             infeasible_vehicles: 0,
@@ -50,6 +54,8 @@ impl ZoneMetrics {
         self.vehicles += 1;
         self.time_s += time_s;
         self.energy += visit.energy;
+        self.wait_s += visit.wait_s;
+        self.exposure_m_s += visit.exposure_m_s;
         if visit.fe_s > 0.0 {
             self.fe_vehicles += 1;
             self.fe_s += visit.fe_s;
@@ -82,6 +88,8 @@ impl ZoneMetrics {
             mean_time_s,
             mean_energy,
             mean_objective: beta * mean_time_s + mean_energy,
+            mean_wait_s: mean(self.wait_s, self.vehicles),
+            mean_exposure_m_s: mean(self.exposure_m_s, self.vehicles),
             fe_vehicles: self.fe_vehicles,
             fe_mean_s: mean(self.fe_s, self.fe_vehicles),
             infeasible_vehicles: self.infeasible_vehicles,
@@ -114,6 +122,10 @@ pub struct CompletedVisit {
     pub energy: f64,
     /// Time in FE mode, s.
     pub fe_s: f64,
+    /// Time it waited outside before it entered, s.
+    pub wait_s: f64,
+    /// Integral over time of what its rear-end margin lacks, m s.
+    pub exposure_m_s: f64,
 }
 
 impl CompletedVisit {
@@ -136,6 +148,11 @@ pub struct ZoneSummaryRow {
     pub mean_energy: f64,
     /// Mean objective, beta * time + energy (paper: `eqn:energyobj`).
     pub mean_objective: f64,
+    /// Mean time its vehicles waited outside, from their scheduled arrival until they entered, s; of those that came by a
+    /// road. It counts as time in the total objective.
+    pub mean_wait_s: f64,
+    /// Mean exposure: the integral over time of what the rear-end margin lacks, m s.
+    pub mean_exposure_m_s: f64,
     /// Vehicles that braked in FE mode.
     pub fe_vehicles: u32,
     /// Mean time in FE mode of those vehicles, s.
@@ -148,9 +165,10 @@ pub struct ZoneSummaryRow {
     pub min_merge_margin_m: Option<f64>,
     /// Least crossing margin of any vehicle at its crossing, m; absent when none was needed.
     pub min_cross_margin_m: Option<f64>,
-    /// The same for vehicles whose rear-end entry conditions held when they entered.
+    /// The same for vehicles that were viable toward each leader when they came to owe it something.
     pub min_rear_end_margin_clean_m: Option<f64>,
-    /// The same for vehicles whose merging entry conditions held when they entered.
+    /// The same for vehicles that were viable toward each one that merges or crosses first when they came to owe it
+    /// something.
     pub min_merge_margin_clean_m: Option<f64>,
     /// Times a vehicle passed a conflict point before one that was to pass it first.
     pub order_violations: u32,
@@ -171,7 +189,8 @@ pub struct WorldSummary {
     pub arrived: u32,
     /// Vehicles that left it.
     pub departed: u32,
-    /// Arrivals that had to wait outside because they would have overlapped another vehicle.
+    /// Arrivals that had to wait outside because they would have overlapped another vehicle, or their road's gate held
+    /// them.
     pub held_arrivals: u32,
     /// Vehicles still waiting outside when the run ended.
     pub waiting: u32,

@@ -4,7 +4,8 @@ use super::car::Car;
 use super::role::World;
 use crate::conflict::{Duties, Duty, DutyKind, Row};
 use crate::scenario::{PassingOrder, Scenario, VehicleParams};
-use crate::shield::{RESERVE_M, Shield, yielding_slack_m};
+use crate::shield::{Partner, RESERVE_M, Shield, yielding_slack_m};
+use crate::vehicle::Held;
 use ipc_schemas::Assignment;
 
 /// A duty of a member, its partner being the index of a car.
@@ -16,14 +17,38 @@ pub(super) struct Owed {
     pub standing: Standing,
 }
 
-/// Whether the vehicle was safe toward its partner when it came to owe it something: only then can the
+/// Whether the vehicle was viable toward its partner when it came to owe it something: only then can the
 /// shield hold it to its duty.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Standing {
-    /// No shield has looked yet.
+    /// Nobody has looked yet.
     Unknown,
     Safe,
     Unsafe,
+}
+
+impl Owed {
+    /// Notes whether the vehicle is viable toward its partner as it comes to owe it something, unless nothing is in
+    /// force yet. Returns whether it has found that it is not.
+    pub(super) fn judge(&mut self, shield: &Shield, car: &Car, other: &Car, kinds: &[VehicleParams]) -> bool {
+        let Some(partner) = self.partner(car, other, kinds) else { return false };
+        let is_safe = shield.is_viable(car.x_m, car.v_mps, &partner);
+        self.standing = if is_safe { Standing::Safe } else { Standing::Unsafe };
+        !is_safe
+    }
+
+    /// The partner as the shield sees it, while something is owed to it.
+    pub(super) fn partner(&self, car: &Car, other: &Car, kinds: &[VehicleParams]) -> Option<Partner> {
+        let duty = &self.duty;
+        let kind = duty.in_force(car.x_m, other.x_m)?;
+        Some(Partner {
+            kind,
+            at_m: duty.own_m,
+            gap_m: duty.gap_m,
+            braking_mps2: -kinds[usize::from(other.kind)].u_min_mps2,
+            motion: Held::new(other.x_m + duty.shift_m(), other.v_mps, other.command_mps2),
+        })
+    }
 }
 
 /// The passing order of a zone that is not served in order of entry: vehicles, first to last.

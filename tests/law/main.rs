@@ -11,7 +11,7 @@ use control_zones::control::{
 };
 use control_zones::scenario::{
     ControlParams, FeConditions, Network, PositionFeedback, ReferenceLaw, Replan, SafetyRows, Scenario,
-    Solver, VehicleKind, VehicleParams,
+    Solver, VehicleKind, VehicleParams, ViableParams,
 };
 use control_zones::vehicle::Inequality;
 use proptest::prelude::*;
@@ -58,6 +58,7 @@ fn scenario() -> Scenario {
             feasibility_rows: true,
             fe_conditions: FeConditions::Full,
             fe_fraction: 0.25,
+            viable: ViableParams::DEFAULT,
         },
         beta: 2.0 / 3.0,
         faults: None,

@@ -64,6 +64,12 @@ MODE_ENTERED = 0
 MODE_FE = 1
 #: `VehicleCommand.mode`: OCBF mode, tracking the reference.
 MODE_OCBF = 2
+#: `VehicleCommand.mode`: law `viable`, on the way of its own optimum.
+MODE_FREE = 3
+#: `VehicleCommand.mode`: law `viable`, on schedule.
+MODE_SCHEDULED = 4
+#: `VehicleCommand.mode`: law `viable`, in a slot behind somebody.
+MODE_SLOT = 5
 #: `VehicleCommand.verdict`: no row binds, the reference is tracked as wished.
 VERDICT_NOMINAL = 0
 #: `VehicleCommand.verdict`: feasibility-enforcement mode decided the command.
@@ -376,8 +382,9 @@ class VehicleCommand(ctypes.Structure):
         zone: Its zone.
         binding_rows: Bit per row that decided the command: 0 u_min, 1 u_max, 2 v_min, 3 v_max, 4
             rear end, 5 rear-end feasibility, 6 merge, 7 merge feasibility, 8 cross, 9 cross
-            feasibility.
-        mode: Memory: 0 entered, 1 FE, 2 OCBF; other laws may have other modes.
+            feasibility, 10 comfort, 11 bodies.
+        mode: Memory: 0 entered, 1 FE, 2 OCBF, 3 free, 4 scheduled, 5 slot; other laws may have
+            other modes.
         verdict: 0 nominal, 1 FE, 2 bound by rows, 3 infeasible; only put in by the world when a
             deadline was missed, and refused from a controller: 4 held, 5 held within what the
             shield allows.

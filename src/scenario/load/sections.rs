@@ -3,8 +3,8 @@
 use super::error::ScenarioError;
 use super::table::Table;
 use crate::scenario::{
-    Baseline, ControlParams, FeConditions, FlowPolicy, LawKind, Observed, PositionFeedback, ReferenceLaw,
-    Replan, SafetyRows, Solver, VehicleKind, VehicleParams, ranges,
+    Baseline, ControlParams, EntryRule, FeConditions, FlowPolicy, LawKind, Observed, PositionFeedback,
+    ReferenceLaw, Replan, SafetyRows, Solver, VehicleKind, VehicleParams, ViableParams, ranges,
 };
 
 /// No more kinds of vehicles than this.
@@ -74,7 +74,19 @@ pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<Veh
 pub(super) fn law(table: Option<&Table<'_>>, default: LawKind) -> Result<LawKind, ScenarioError> {
     match table.and_then(|t| t.get("law")) {
         None => Ok(default),
-        Some(field) => field.choice(&[("ocbf", LawKind::Ocbf)]),
+        Some(field) => field.choice(&[("ocbf", LawKind::Ocbf), ("viable", LawKind::Viable)]),
+    }
+}
+
+/// `entry` of `[gate]` or of a road.
+pub(super) fn entry(table: Option<&Table<'_>>, default: EntryRule) -> Result<EntryRule, ScenarioError> {
+    match table.and_then(|t| t.get("entry")) {
+        None => Ok(default),
+        Some(field) => field.choice(&[
+            ("free", EntryRule::Free),
+            ("viable", EntryRule::Viable),
+            ("room_to_stop", EntryRule::RoomToStop),
+        ]),
     }
 }
 
@@ -119,6 +131,7 @@ pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlPar
         feasibility_rows: true,
         fe_conditions: FeConditions::Full,
         fe_fraction: 0.25,
+        viable: ViableParams::DEFAULT,
     };
     let Some(t) = table else { return Ok(params) };
     t.only(&[
@@ -137,6 +150,7 @@ pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlPar
         "feasibility_rows",
         "fe_conditions",
         "fe_fraction",
+        "viable",
     ])?;
     let gain = |key, default| t.within_or(key, default, &ranges::GAIN);
     let p = &mut params;
@@ -173,7 +187,39 @@ pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlPar
         |f| f > 0.0 && f <= 1.0,
         "a fraction with 0 < fe_fraction <= 1",
     )?;
+    if let Some(field) = t.get("viable") {
+        p.viable = viable(&field.table("a table such as {k_comfort_per_s = 1}")?)?;
+    }
     Ok(params)
+}
+
+/// `control.viable`.
+fn viable(t: &Table<'_>) -> Result<ViableParams, ScenarioError> {
+    t.only(&[
+        "viability",
+        "comfort",
+        "bodies",
+        "slots",
+        "k_comfort_per_s",
+        "k_recovery_per_s",
+        "clearance_m",
+        "buffer_m",
+        "buffer_s",
+        "passage_weight",
+    ])?;
+    let default = ViableParams::DEFAULT;
+    Ok(ViableParams {
+        viability: t.bool_or("viability", default.viability)?,
+        comfort: t.bool_or("comfort", default.comfort)?,
+        bodies: t.bool_or("bodies", default.bodies)?,
+        slots: t.bool_or("slots", default.slots)?,
+        k_comfort_per_s: t.within_or("k_comfort_per_s", default.k_comfort_per_s, &ranges::GAIN)?,
+        k_recovery_per_s: t.within_or("k_recovery_per_s", default.k_recovery_per_s, &ranges::GAIN)?,
+        clearance_m: t.within_or("clearance_m", default.clearance_m, &ranges::STANDSTILL_GAP)?,
+        buffer_m: t.within_or("buffer_m", default.buffer_m, &ranges::STANDSTILL_GAP)?,
+        buffer_s: t.within_or("buffer_s", default.buffer_s, &ranges::REACTION_TIME)?,
+        passage_weight: t.within_or("passage_weight", default.passage_weight, &ranges::SHARE)?,
+    })
 }
 
 /// What a zone's policy can observe: the lengths of the approaches of the zone downstream, if there is one.
