@@ -18,6 +18,7 @@ mod run;
 mod say;
 mod sdk;
 mod show;
+mod sibling;
 mod supervise;
 
 #[cfg(fuzzing)]
@@ -146,6 +147,8 @@ pub fn cz() -> ExitCode {
             args::Command::Bench(args) => bench::bench(&args),
             args::Command::Plugin { command } => plugin::plugin(&command),
             args::Command::Sdk { command } => sdk::sdk(&command),
+            args::Command::Export(args) => sibling::EXPORT.run(&args.arguments),
+            args::Command::Report(args) => sibling::REPORT.run(&args.arguments),
         },
     )
 }

@@ -3,7 +3,7 @@
 use super::show::number;
 use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
-use crate::process::{LatencyUs, Outcome, Punctuality, Replacement, Settled};
+use crate::process::{LatencyBin, LatencyUs, Outcome, Punctuality, Replacement, Settled};
 use crate::scenario::{Demand, Road, Scenario, ShieldMode};
 use crate::world::{FaultCounts, OverlapSummary, ShieldSummary, Stall, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
@@ -25,6 +25,7 @@ pub(super) struct Summary {
     state_hash: String,
     wall_s: f64,
     step_latency_us: LatencyUs,
+    step_latency_histogram: Vec<LatencyBin>,
     zones: Vec<ZoneSummaryRow>,
     total_objective: f64,
     arrived: u32,
@@ -85,6 +86,7 @@ impl Summary {
             state_hash: format!("{:016x}", world.state_hash),
             wall_s: outcome.wall_s,
             step_latency_us: outcome.step_latency_us,
+            step_latency_histogram: outcome.step_latency_histogram,
             total_objective: world
                 .zones
                 .iter()

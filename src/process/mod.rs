@@ -21,7 +21,7 @@ mod world;
 
 pub use attach::{Attachment, Joining};
 pub use observe::{Observation, RecordLag};
-pub use outcome::{LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, new_histogram};
+pub use outcome::{LatencyBin, LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, new_histogram};
 pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
 pub use participant::{run_controller, run_coordinator};
 pub use peers::{Peer, Peers, children_of, is_stopped};

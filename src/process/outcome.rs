@@ -20,6 +20,15 @@ pub struct LatencyUs {
     pub max: f64,
 }
 
+/// Steps whose latency was above the bin before and not above this.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct LatencyBin {
+    /// Upper end, us.
+    pub up_to_us: f64,
+    /// Number of steps.
+    pub steps: u64,
+}
+
 /// What a finished run has come to.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Outcome {
@@ -29,6 +38,9 @@ pub struct Outcome {
     pub wall_s: f64,
     /// Step latency.
     pub step_latency_us: LatencyUs,
+    /// The same as a histogram: four bins to an octave, from the least to the greatest that has a step.
+    #[serde(default)]
+    pub step_latency_histogram: Vec<LatencyBin>,
     /// Latency of steps in which no coordinator acted, after a warm-up.
     pub steady_ns: Percentiles,
     /// Latency of steps in which one did, after a warm-up.
@@ -169,6 +181,7 @@ impl StepMeter {
                 p999: us(self.latency_ns.value_at_quantile(0.999)),
                 max: us(self.latency_ns.max()),
             },
+            step_latency_histogram: bins(&self.latency_ns),
             steady_ns: Percentiles::of(&self.steady_ns),
             event_ns: Percentiles::of(&self.event_ns),
             peak_rss_bytes: peak_rss_bytes(),
@@ -179,6 +192,16 @@ impl StepMeter {
             placement: Vec::new(),
         }
     }
+}
+
+/// A histogram's counts by bins whose ends have the ratio 2^(1/4).
+fn bins(histogram: &Histogram<u64>) -> Vec<LatencyBin> {
+    const FIRST_NS: u64 = 64;
+    let bins = histogram.iter_log(FIRST_NS, 2.0_f64.powf(0.25)).map(|bin| LatencyBin {
+        up_to_us: bin.value_iterated_to() as f64 / 1e3,
+        steps: bin.count_since_last_iteration(),
+    });
+    bins.skip_while(|bin| bin.steps == 0).collect()
 }
 
 /// What happened to the participants of a run.

@@ -15,6 +15,7 @@ pub(super) use conduct::{ConductArgs, Restart, ShareArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
 pub(super) use run::{KeepArgs, PartArgs, RunArgs, SupervisedArgs, WorldArgs};
 pub(super) use scenario::ScenarioArgs;
+use std::ffi::OsString;
 use std::path::PathBuf;
 
 /// Safe, optimal coordination of connected automated vehicles through networks of control zones.
@@ -66,11 +67,25 @@ pub(super) enum Command {
         #[command(subcommand)]
         command: PluginCommand,
     },
+    /// Write a recording in the formats of other tools (the program cz-export).
+    #[command(disable_help_flag = true, disable_version_flag = true)]
+    Export(SiblingArgs),
+    /// Make one page of recordings: tables, map, figures, events (the program cz-report).
+    #[command(disable_help_flag = true, disable_version_flag = true)]
+    Report(SiblingArgs),
     /// What controllers in C and C++ are built against.
     Sdk {
         #[command(subcommand)]
         command: SdkCommand,
     },
+}
+
+/// For the program it is handed to.
+#[derive(Debug, Args)]
+pub(super) struct SiblingArgs {
+    /// Its arguments; `--help` says which.
+    #[arg(trailing_var_arg = true, allow_hyphen_values = true, value_name = "ARGUMENTS")]
+    pub arguments: Vec<OsString>,
 }
 
 #[derive(Debug, Args)]

@@ -1,0 +1,45 @@
+//! Commands that are programs of their own: `cz NAME` runs `cz-NAME` beside it.
+
+#![allow(clippy::unwrap_used)]
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// A `cz` in a directory of its own, with nothing beside it.
+fn alone(directory: &Path) -> PathBuf {
+    let program = directory.join("cz");
+    std::fs::copy(env!("CARGO_BIN_EXE_cz"), &program).unwrap();
+    program
+}
+
+/// Runs it as somebody would who has no cargo.
+fn run(program: &Path, arguments: &[&str]) -> Output {
+    Command::new(program)
+        .args(arguments)
+        .env_remove("CARGO")
+        .env_remove("CARGO_MANIFEST_DIR")
+        .output()
+        .unwrap()
+}
+
+#[test]
+fn a_program_that_is_not_there_is_named_with_what_makes_it() {
+    let directory = tempfile::tempdir().unwrap();
+    let output = run(&alone(directory.path()), &["report", "a.czlog"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!((output.status.code(), said.lines().count()), (Some(2), 1), "{said}");
+    assert!(said.contains("cz-report is not there") && said.contains("--package cz-export"), "{said}");
+}
+
+#[test]
+fn arguments_and_exit_code_go_through_as_they_are() {
+    let directory = tempfile::tempdir().unwrap();
+    let program = alone(directory.path());
+    let sibling = directory.path().join("cz-export");
+    std::fs::write(&sibling, "#!/bin/sh\nprintf '%s|' \"$@\"\nexit 7\n").unwrap();
+    std::fs::set_permissions(&sibling, PermissionsExt::from_mode(0o755)).unwrap();
+    let output = run(&program, &["export", "a b.czlog", "--to", "fcd", "--help", "-V", "--", "--out"]);
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert_eq!((output.status.code(), said.as_str()), (Some(7), "a b.czlog|--to|fcd|--help|-V|--|--out|"));
+}
