@@ -2,10 +2,10 @@
 
 use control_zones::lockstep::{LockstepError, in_process::InProcess};
 use control_zones::scenario::{
-    Baseline, ControlParams, Demand, Downstream, EntryRule, Exit, FeConditions, FlowPolicy, LawKind, Network,
-    Observed, PassingOrder, Path, Poisson, PositionFeedback, RatePeriod, ReferenceLaw, Replan, Road,
-    SafetyRows, Scenario, Segment as Lane, Solver, Source, SpeedDistribution, VehicleKind, VehicleParams,
-    ViableParams, Zone,
+    Baseline, ControlParams, CoordinationParams, Demand, Downstream, EntryRule, Exit, FeConditions,
+    FlowPolicy, LawKind, Network, Observed, PassingOrder, Path, Poisson, PositionFeedback, RatePeriod,
+    ReferenceLaw, Replan, Road, SafetyRows, Scenario, ScheduleKind, Segment as Lane, Solver, Source,
+    SpeedDistribution, VehicleKind, VehicleParams, ViableParams, Zone,
 };
 use control_zones::world::{World, WorldSummary};
 use ipc_schemas::{NO_ZONE, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState};
@@ -196,8 +196,13 @@ fn network(raw: &[RawZone]) -> Network {
 
 fn scenario() -> impl Strategy<Value = Scenario> {
     let dt_ns = prop_oneof![4 => Just(100_000_000_u64), 1 => Just(50_000_000), 1 => Just(200_000_000)];
-    (prop::collection::vec(zone(), 1..=6), control(), any::<u64>(), dt_ns).prop_map(
-        |(raw, control, seed, dt_ns)| Scenario {
+    let schedule = prop_oneof![
+        2 => Just(ScheduleKind::None),
+        1 => Just(ScheduleKind::Pooled),
+        1 => Just(ScheduleKind::Tandem),
+    ];
+    (prop::collection::vec(zone(), 1..=6), control(), schedule, any::<u64>(), dt_ns).prop_map(
+        |(raw, control, schedule, seed, dt_ns)| Scenario {
             plugins: Vec::new(),
             shield: control_zones::scenario::ShieldMode::Off,
             faults: None,
@@ -210,6 +215,7 @@ fn scenario() -> impl Strategy<Value = Scenario> {
             vehicle: VEHICLE,
             fleet: vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: VEHICLE }],
             control,
+            coordination: CoordinationParams { schedule, ..CoordinationParams::DEFAULT },
             beta: 2.0 / 3.0,
         },
     )

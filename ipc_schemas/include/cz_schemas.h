@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0x2291d52fc5522958)
+#define CZ_SCHEMA_HASH UINT64_C(0xf214663ee06bf4cd)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -80,6 +80,15 @@
 /** `cz_assignment_t.flags`: the terminal speed is free; `terminal_speed_mps` is 0 and means
  *  nothing. */
 #define CZ_ASSIGNMENT_FREE_TERMINAL UINT16_C(1)
+/** `cz_assignment_t.flags`: how often the vehicle was passed in its zone by others that entered
+ *  later, in units of `CZ_ASSIGNMENT_PASSED_ONCE`. */
+#define CZ_ASSIGNMENT_PASSED UINT16_C(6)
+/** `cz_assignment_t.flags`: the unit of `CZ_ASSIGNMENT_PASSED`. */
+#define CZ_ASSIGNMENT_PASSED_ONCE UINT16_C(2)
+
+/** `cz_zone_summary_t.flags`: the vehicle is in the zone that is described and goes to the one that
+ *  is told; without it, it is ahead of those that come from the zone that is told. */
+#define CZ_SUMMARY_COMING UINT16_C(1)
 
 /** `cz_vehicle_command_t.mode`: entered, not yet decided on (never sent by the built-in law). */
 #define CZ_MODE_ENTERED UINT16_C(0)
@@ -198,7 +207,7 @@
 #define CZ_TYPE_NAME_FRAME_HEADER "cz.FrameHeader.v1"
 #define CZ_TYPE_NAME_VEHICLE_STATE "cz.VehicleState.v2"
 #define CZ_TYPE_NAME_ASSIGNMENT "cz.Assignment.v3"
-#define CZ_TYPE_NAME_ZONE_SUMMARY "cz.ZoneSummary.v1"
+#define CZ_TYPE_NAME_ZONE_SUMMARY "cz.ZoneSummary.v2"
 #define CZ_TYPE_NAME_VEHICLE_COMMAND "cz.VehicleCommand.v2"
 #define CZ_TYPE_NAME_MEMBER "cz.Member.v1"
 #define CZ_TYPE_NAME_ATTACH_REQUEST "cz.AttachRequest.v1"
@@ -359,7 +368,8 @@ typedef struct cz_assignment {
     uint32_t rank;
     /** 0 none, 1 rear end, 2 merge, 3 cross. */
     uint16_t kind;
-    /** Bit 0: the terminal speed is free. */
+    /** Bit 0: the terminal speed is free; bits 1 and 2: how often the vehicle was passed in its
+     *  zone. */
     uint16_t flags;
 } cz_assignment_t;
 CZ_ASSERT_(assignment_size, sizeof(cz_assignment_t) == 80);
@@ -381,12 +391,25 @@ CZ_ASSERT_(assignment_flags_offset, offsetof(cz_assignment_t, flags) == 78);
 
 /** A zone's traffic, told to one neighbour at the zone's own events.
  *
- *  Sent in step `k`, acted upon in step `k + 1`, whether or not both zones live in one process. */
+ *  Sent in step `k`, acted upon in step `k + 1`, whether or not both zones live in one process.
+ *  Where zones schedule in tandem, there is a record for each vehicle that concerns the neighbour:
+ *  those that go there, and, for those from there, those ahead of them; in order of entry.
+ *  Otherwise, and when there are none, it is one record with `vehicle = CZ_NO_VEHICLE`. What is not
+ *  about the vehicle is the same in all. */
 typedef struct cz_zone_summary {
     /** Length l of the first segment the neighbour asked about, m. */
     double segment_m;
     /** Mean speed of the vehicles in that segment, m/s (0 when it is empty). */
     double segment_mean_speed_mps;
+    /** Position of the vehicle on its path in the downstream one of the two zones, m; negative
+     *  before its origin. */
+    double x_m;
+    /** Its speed, m/s. */
+    double v_mps;
+    /** Instant at which it plans to leave the zone that is described, s (0 when it has no plan). */
+    double planned_exit_time_s;
+    /** Speed at that instant, m/s. */
+    double planned_exit_speed_mps;
     /** Zone that is described. */
     uint32_t from_zone;
     /** Zone that is told. */
@@ -395,15 +418,34 @@ typedef struct cz_zone_summary {
     uint32_t vehicles;
     /** Number of them within the first segment, N(l). */
     uint32_t segment_vehicles;
+    /** A vehicle, or `CZ_NO_VEHICLE`. */
+    uint32_t vehicle;
+    /** Its path in the downstream one of the two zones. */
+    uint32_t path;
+    /** Its path in the zone after that, or `CZ_NO_PATH`. */
+    uint32_t next_path;
+    /** Its kind: index in the scenario's fleet. */
+    uint16_t kind;
+    /** Bit 0: the vehicle comes to the zone that is told. */
+    uint16_t flags;
 } cz_zone_summary_t;
-CZ_ASSERT_(zone_summary_size, sizeof(cz_zone_summary_t) == 32);
+CZ_ASSERT_(zone_summary_size, sizeof(cz_zone_summary_t) == 80);
 CZ_ASSERT_ALIGN_(cz_zone_summary_t, 8);
 CZ_ASSERT_(zone_summary_segment_m_offset, offsetof(cz_zone_summary_t, segment_m) == 0);
 CZ_ASSERT_(zone_summary_segment_mean_speed_mps_offset, offsetof(cz_zone_summary_t, segment_mean_speed_mps) == 8);
-CZ_ASSERT_(zone_summary_from_zone_offset, offsetof(cz_zone_summary_t, from_zone) == 16);
-CZ_ASSERT_(zone_summary_to_zone_offset, offsetof(cz_zone_summary_t, to_zone) == 20);
-CZ_ASSERT_(zone_summary_vehicles_offset, offsetof(cz_zone_summary_t, vehicles) == 24);
-CZ_ASSERT_(zone_summary_segment_vehicles_offset, offsetof(cz_zone_summary_t, segment_vehicles) == 28);
+CZ_ASSERT_(zone_summary_x_m_offset, offsetof(cz_zone_summary_t, x_m) == 16);
+CZ_ASSERT_(zone_summary_v_mps_offset, offsetof(cz_zone_summary_t, v_mps) == 24);
+CZ_ASSERT_(zone_summary_planned_exit_time_s_offset, offsetof(cz_zone_summary_t, planned_exit_time_s) == 32);
+CZ_ASSERT_(zone_summary_planned_exit_speed_mps_offset, offsetof(cz_zone_summary_t, planned_exit_speed_mps) == 40);
+CZ_ASSERT_(zone_summary_from_zone_offset, offsetof(cz_zone_summary_t, from_zone) == 48);
+CZ_ASSERT_(zone_summary_to_zone_offset, offsetof(cz_zone_summary_t, to_zone) == 52);
+CZ_ASSERT_(zone_summary_vehicles_offset, offsetof(cz_zone_summary_t, vehicles) == 56);
+CZ_ASSERT_(zone_summary_segment_vehicles_offset, offsetof(cz_zone_summary_t, segment_vehicles) == 60);
+CZ_ASSERT_(zone_summary_vehicle_offset, offsetof(cz_zone_summary_t, vehicle) == 64);
+CZ_ASSERT_(zone_summary_path_offset, offsetof(cz_zone_summary_t, path) == 68);
+CZ_ASSERT_(zone_summary_next_path_offset, offsetof(cz_zone_summary_t, next_path) == 72);
+CZ_ASSERT_(zone_summary_kind_offset, offsetof(cz_zone_summary_t, kind) == 76);
+CZ_ASSERT_(zone_summary_flags_offset, offsetof(cz_zone_summary_t, flags) == 78);
 
 /** One vehicle's command for the step, and what its controller must remember.
  *

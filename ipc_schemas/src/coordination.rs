@@ -20,6 +20,11 @@ codes! {
 
     /// [`Assignment::flags`]: the terminal speed is free; `terminal_speed_mps` is 0 and means nothing.
     pub const ASSIGNMENT_FREE_TERMINAL: u16 = 1;
+    /// [`Assignment::flags`]: how often the vehicle was passed in its zone by others that entered later, in units of
+    /// [`ASSIGNMENT_PASSED_ONCE`].
+    pub const ASSIGNMENT_PASSED: u16 = 6;
+    /// [`Assignment::flags`]: the unit of [`ASSIGNMENT_PASSED`].
+    pub const ASSIGNMENT_PASSED_ONCE: u16 = 2;
 }
 
 record! {
@@ -62,7 +67,7 @@ record! {
         pub rank: u32,
         /// 0 none, 1 rear end, 2 merge, 3 cross.
         pub kind: u16,
-        /// Bit 0: the terminal speed is free.
+        /// Bit 0: the terminal speed is free; bits 1 and 2: how often the vehicle was passed in its zone.
         pub flags: u16,
     }
 }

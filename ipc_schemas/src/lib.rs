@@ -54,10 +54,11 @@ pub const LAYOUTS: [Layout; 11] = [
 ///
 /// Not part of the schema hash: a new code does not change a layout. Changing the meaning of an old one
 /// is a new version of the record that carries it.
-pub const CODES: [&[Code]; 7] = [
+pub const CODES: [&[Code]; 8] = [
     header::CODES,
     state::CODES,
     coordination::CODES,
+    summary::CODES,
     command::CODES,
     attach::CODES,
     run_spec::CODES,

@@ -78,15 +78,24 @@ const GOLDEN: [Golden; 11] = [
         ],
     ),
     (
-        "cz.ZoneSummary.v1",
-        32,
+        "cz.ZoneSummary.v2",
+        80,
         &[
             ("segment_m", "f64", 0),
             ("segment_mean_speed_mps", "f64", 8),
-            ("from_zone", "u32", 16),
-            ("to_zone", "u32", 20),
-            ("vehicles", "u32", 24),
-            ("segment_vehicles", "u32", 28),
+            ("x_m", "f64", 16),
+            ("v_mps", "f64", 24),
+            ("planned_exit_time_s", "f64", 32),
+            ("planned_exit_speed_mps", "f64", 40),
+            ("from_zone", "u32", 48),
+            ("to_zone", "u32", 52),
+            ("vehicles", "u32", 56),
+            ("segment_vehicles", "u32", 60),
+            ("vehicle", "u32", 64),
+            ("path", "u32", 68),
+            ("next_path", "u32", 72),
+            ("kind", "u16", 76),
+            ("flags", "u16", 78),
         ],
     ),
     (
@@ -210,7 +219,7 @@ const GOLDEN: [Golden; 11] = [
 ];
 
 /// XXH3-64 of the schema text of [`GOLDEN`].
-const GOLDEN_HASH: u64 = 0x2291_d52f_c552_2958;
+const GOLDEN_HASH: u64 = 0xf214_663e_e06b_f4cd;
 
 fn crate_dir() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))

@@ -1,13 +1,14 @@
 //! The coordinator of a contiguous range of zones, from state and summary frames to coordination.
 
-use super::assign::Assigner;
+use super::assign::{Assigner, Decided};
 use super::flow::FlowController;
-use super::order::Orders;
+use super::order::{Means, Order, Orders};
+use super::schedule::{Heard, Scene, Scheduler};
 use super::summaries::{Audience, is_event};
 use crate::conflict::Conflicts;
 use crate::control::Terminal;
-use crate::scenario::{Scenario, ZoneId};
-use ipc_schemas::{Assignment, VehicleState, ZoneSummary};
+use crate::scenario::{Scenario, ScheduleKind, ZoneId};
+use ipc_schemas::{ASSIGNMENT_PASSED, ASSIGNMENT_PASSED_ONCE, Assignment, VehicleState, ZoneSummary};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -24,6 +25,7 @@ pub struct Coordinator {
     posts: Vec<Post>,
     assigner: Assigner,
     orders: Orders,
+    scheduler: Scheduler,
     /// Summaries of this step to zones of this process, delivered in the next one.
     internal: Vec<ZoneSummary>,
     internal_step: u64,
@@ -42,8 +44,10 @@ struct Post {
     exits: Vec<ExitPost>,
     /// Terminal condition by exit, as decided last.
     terminals: Vec<Terminal>,
-    /// The zone's vehicles in passing order, as decided last.
-    order: Vec<u32>,
+    /// The passing order as decided last.
+    order: Order,
+    /// What neighbours have told of their vehicles, where zones schedule in tandem.
+    heard: Vec<Heard>,
     told: bool,
 }
 
@@ -64,20 +68,33 @@ impl Post {
             to: exit.to.map(|to| to.zone),
             downstream: None,
         });
+        let is_tandem = scenario.coordination.schedule == ScheduleKind::Tandem;
+        let network = &scenario.network;
+        let heard = network.neighbours(zone).filter(|_| is_tandem).map(|from| {
+            let is_downstream = network.downstream(zone).any(|next| next == from);
+            let conflicts = is_downstream.then(|| Conflicts::of(network, from));
+            Heard { from, conflicts, summaries: Vec::new() }
+        });
         Post {
-            conflicts: Conflicts::of(&scenario.network, zone),
-            audience: Audience::of(&scenario.network, zone),
+            conflicts: Conflicts::of(network, zone),
+            audience: Audience::of(scenario, zone),
             exits: exits.collect(),
             terminals: Vec::new(),
-            order: Vec::new(),
+            order: Order::default(),
+            heard: heard.collect(),
             told: false,
         }
     }
 
-    /// Keeps what a zone downstream says.
-    fn hear(&mut self, summary: &ZoneSummary) {
-        for exit in self.exits.iter_mut().filter(|exit| exit.to == Some(summary.from_zone)) {
-            exit.downstream = Some(*summary);
+    /// Keeps what a neighbour says.
+    fn hear(&mut self, summaries: &[ZoneSummary]) {
+        let from = summaries[0].from_zone;
+        for exit in self.exits.iter_mut().filter(|exit| exit.to == Some(from)) {
+            exit.downstream = Some(summaries[0]);
+        }
+        for heard in self.heard.iter_mut().filter(|heard| heard.from == from) {
+            heard.summaries.clear();
+            heard.summaries.extend_from_slice(summaries);
         }
     }
 }
@@ -91,6 +108,7 @@ impl Coordinator {
             posts,
             assigner: Assigner::default(),
             orders: Orders::new(&scenario),
+            scheduler: Scheduler::default(),
             internal: Vec::new(),
             internal_step: 0,
             external: Vec::new(),
@@ -113,31 +131,37 @@ impl Coordinator {
     /// Takes the summaries another coordinator sent in the previous step; those to zones of other
     /// processes are skipped.
     pub fn receive(&mut self, summaries: &[ZoneSummary]) {
-        for summary in summaries {
-            if self.zones.contains(&summary.to_zone) {
-                let post = &mut self.posts[(summary.to_zone - self.zones.start) as usize];
+        for group in summaries.chunk_by(is_of_one) {
+            let zone = group[0].to_zone;
+            if self.zones.contains(&zone) {
+                let post = &mut self.posts[(zone - self.zones.start) as usize];
                 post.told = true;
-                self.told.push(summary.to_zone);
-                post.hear(summary);
+                self.told.push(zone);
+                post.hear(group);
             }
         }
     }
 
-    /// Takes over from another coordinator: `downstream` are the last summaries its zones acted on, `due`
+    /// Takes over from another coordinator: `heard` are the last summaries of each neighbour its zones acted on, `due`
     /// those sent in the step before the first this one acts in, `in_force` the assignments of before that step.
-    pub fn restore(&mut self, downstream: &[ZoneSummary], due: &[ZoneSummary], in_force: &[Assignment]) {
+    pub fn restore(&mut self, heard: &[ZoneSummary], due: &[ZoneSummary], in_force: &[Assignment]) {
         for group in in_force.chunk_by(|a, b| a.zone == b.zone) {
             if self.zones.contains(&group[0].zone) {
                 let mut ranks: Vec<(u32, u32)> = group.iter().map(|a| (a.rank, a.vehicle)).collect();
                 ranks.sort_unstable();
                 ranks.dedup();
-                let order = ranks.into_iter().map(|(_, vehicle)| vehicle).collect();
+                let vehicles = ranks.into_iter().map(|(_, vehicle)| vehicle).collect();
+                let times = |a: &Assignment| (a.flags & ASSIGNMENT_PASSED) / ASSIGNMENT_PASSED_ONCE;
+                let mut passed: Vec<(u32, u16)> = group.iter().map(|a| (a.vehicle, times(a))).collect();
+                passed.retain(|(_, times)| *times > 0);
+                passed.dedup();
+                let order = Order { vehicles, passed };
                 self.posts[(group[0].zone - self.zones.start) as usize].order = order;
             }
         }
-        for summary in downstream {
-            if self.zones.contains(&summary.to_zone) {
-                self.posts[(summary.to_zone - self.zones.start) as usize].hear(summary);
+        for group in heard.chunk_by(is_of_one) {
+            if self.zones.contains(&group[0].to_zone) {
+                self.posts[(group[0].to_zone - self.zones.start) as usize].hear(group);
             }
         }
         self.receive(due);
@@ -158,6 +182,7 @@ impl Coordinator {
         self.internal_step = step;
         self.external.clear();
         self.assignments.clear();
+        let time_s = self.scenario.time_s(step);
         for slice in states.chunk_by(|a, b| a.zone == b.zone) {
             let zone = slice[0].zone;
             if !self.zones.contains(&zone) {
@@ -177,15 +202,24 @@ impl Coordinator {
                 }
             }
             if event || told {
-                let terminals = post.exits.iter().map(|exit| exit.flow.terminal(exit.downstream.as_ref()));
+                // Whoever is told when to leave is not told how fast as well.
+                let is_scheduled = self.scenario.coordination.schedule != ScheduleKind::None;
+                let members = &slice[slice.iter().take_while(|state| state.has_left()).count()..];
+                let terminals = post.exits.iter().map(|exit| match is_scheduled {
+                    true => Terminal::Free,
+                    false => exit.flow.terminal(members, exit.downstream.as_ref()),
+                });
                 post.terminals.clear();
                 post.terminals.extend(terminals);
-                let Post { conflicts, terminals, order, .. } = post;
-                let policy = self.scenario.network.zones[zone as usize].order;
-                let members = &slice[slice.iter().take_while(|state| state.has_left()).count()..];
-                self.orders.update(policy, &self.scenario, conflicts, members, order);
-                let assignments = &mut self.assignments;
-                self.assigner.assign(&self.scenario, conflicts, slice, order, terminals, assignments);
+                let Post { conflicts, terminals, order, heard, .. } = post;
+                let Coordinator { scenario, assigner, orders, scheduler, assignments, .. } = self;
+                let scene = Scene { scenario, conflicts, slice, time_s, heard };
+                let policy = scenario.network.zones[zone as usize].order;
+                orders.update(policy, &scene, order, &mut Means { assigner, scheduler });
+                assigner.derive(&scene, &order.vehicles);
+                let times_s =
+                    if scene.is_scheduled() { scheduler.schedule(&scene, &assigner.queue()) } else { &[] };
+                assigner.assign(&scene, &Decided { terminals, passed: &order.passed, times_s }, assignments);
             }
         }
         for zone in self.told.drain(..) {
@@ -203,4 +237,9 @@ impl Coordinator {
     pub fn summaries(&self, zones: Range<ZoneId>) -> impl Iterator<Item = ZoneSummary> + '_ {
         self.external.iter().filter(move |s| zones.contains(&s.to_zone)).copied()
     }
+}
+
+/// Whether two summaries tell one zone about one other.
+fn is_of_one(a: &ZoneSummary, b: &ZoneSummary) -> bool {
+    (a.from_zone, a.to_zone) == (b.from_zone, b.to_zone)
 }

@@ -1,10 +1,13 @@
 //! Flow control: the terminal speed v_m of a zone from what its downstream neighbour reports
 //! (paper: section "Problem 2", `equ:feedback_control`).
 
+mod predicted;
+
 use crate::control::Terminal;
 use crate::control::ocbf::mean_optimal_terminal_speed_mps;
 use crate::scenario::{Baseline, Exit, FlowPolicy, Observed, Scenario, Zone};
-use ipc_schemas::ZoneSummary;
+use ipc_schemas::{VehicleState, ZoneSummary};
+use predicted::Prediction;
 
 /// One exit's policy, ready to be evaluated at events.
 #[derive(Clone, Debug)]
@@ -13,6 +16,7 @@ pub struct FlowController {
     /// v_b of a feedback policy, given or computed, m/s.
     baseline_mps: f64,
     v_max_mps: f64,
+    prediction: Option<Prediction>,
 }
 
 /// Length of the downstream segment a policy observes, m (0 when it observes none).
@@ -36,14 +40,22 @@ impl FlowController {
             }
             _ => 0.0,
         };
-        FlowController { policy: exit.flow.clone(), baseline_mps, v_max_mps: scenario.vehicle.v_max_mps }
+        let prediction = match exit.flow {
+            FlowPolicy::Predicted { min_mps } => Some(Prediction::new(scenario, zone, exit, min_mps)),
+            _ => None,
+        };
+        let v_max_mps = scenario.vehicle.v_max_mps;
+        FlowController { policy: exit.flow.clone(), baseline_mps, v_max_mps, prediction }
     }
 
-    /// The terminal condition, given the last summary of the downstream zone (none before its first
-    /// event, when it is empty).
-    pub fn terminal(&self, downstream: Option<&ZoneSummary>) -> Terminal {
+    /// The terminal condition, given the zone's members and the last summary of the downstream zone (none before its
+    /// first event, when it is empty).
+    pub fn terminal(&self, members: &[VehicleState], downstream: Option<&ZoneSummary>) -> Terminal {
         match &self.policy {
             FlowPolicy::None => Terminal::Free,
+            FlowPolicy::Predicted { .. } => {
+                self.prediction.as_ref().map_or(Terminal::Free, |p| p.terminal(members, downstream))
+            }
             FlowPolicy::Fixed { terminal_mps } => Terminal::Speed(*terminal_mps),
             FlowPolicy::Feedback { gain_mps, segment, min_mps, .. } => {
                 let count = downstream.map_or(0, |s| match segment {

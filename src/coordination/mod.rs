@@ -4,6 +4,7 @@ mod assign;
 mod coordinator;
 mod flow;
 mod order;
+pub mod schedule;
 mod summaries;
 
 pub use coordinator::Coordinator;

@@ -4,7 +4,8 @@
 //! that meet there pass in the order of the list. So nobody can wait in a circle within a zone: the first of the
 //! list waits for nobody in it.
 
-use super::assign::row;
+use super::assign::{Assigner, row};
+use super::schedule::{Scene, Scheduler};
 use crate::conflict::{Conflicts, Duties, Row};
 use crate::scenario::{PassingOrder, Scenario};
 use crate::shield::{Shield, yielding_slack_m};
@@ -12,6 +13,42 @@ use ipc_schemas::VehicleState;
 
 /// A vehicle that lets a newcomer pass first keeps at least this much slack, m: it is not to brake hard for it.
 const YIELDING_SLACK_M: f64 = 0.5;
+/// A newcomer is put ahead of no more than this many others that it meets.
+const MOST_FORWARD: u32 = 3;
+/// Nobody is passed more often in a zone than this.
+const MOST_PASSED: u16 = 2;
+/// A vehicle is not passed when it is nearer than this to where it meets the newcomer, m.
+const LEAST_BEFORE_POINT_M: f64 = 60.0;
+/// By how much an order must be cheaper to be preferred to that of entry.
+const LEAST_GAIN: f64 = 0.02;
+
+/// A zone's passing order as decided last.
+#[derive(Debug, Default)]
+pub(super) struct Order {
+    /// The zone's vehicles, first to last.
+    pub(super) vehicles: Vec<u32>,
+    /// How often vehicles were passed by newcomers, of those that were.
+    pub(super) passed: Vec<(u32, u16)>,
+}
+
+impl Order {
+    fn times_passed(&self, vehicle: u32) -> u16 {
+        self.passed.iter().find(|(other, _)| *other == vehicle).map_or(0, |(_, times)| *times)
+    }
+
+    fn is_passed(&mut self, vehicle: u32) {
+        match self.passed.iter_mut().find(|(other, _)| *other == vehicle) {
+            Some((_, times)) => *times += 1,
+            None => self.passed.push((vehicle, 1)),
+        }
+    }
+}
+
+/// What deciding by cost takes.
+pub(super) struct Means<'a> {
+    pub(super) assigner: &'a mut Assigner,
+    pub(super) scheduler: &'a mut Scheduler,
+}
 
 /// Decides orders; kept from use to use for its allocations.
 #[derive(Debug)]
@@ -19,39 +56,143 @@ pub(super) struct Orders {
     /// By kind of vehicle.
     shields: Vec<Shield>,
     duties: Duties,
+    /// An order that is tried.
+    tried: Vec<u32>,
+    /// Places a newcomer may be put at.
+    places: Vec<usize>,
 }
 
 impl Orders {
     pub(super) fn new(scenario: &Scenario) -> Orders {
         let shields = scenario.fleet.iter().map(|kind| Shield::new(&kind.vehicle, scenario.dt_s()));
-        Orders { shields: shields.collect(), duties: Duties::default() }
+        Orders {
+            shields: shields.collect(),
+            duties: Duties::default(),
+            tried: Vec::new(),
+            places: Vec::new(),
+        }
     }
 
-    /// Brings a zone's order up to date: `order` has the vehicles in the order decided last, and afterwards those of the
-    /// zone's members. `members` are in order of entry.
+    /// Brings a zone's order up to date: `order` is the one decided last, and afterwards that of the zone's members.
     pub(super) fn update(
         &mut self,
         policy: PassingOrder,
-        scenario: &Scenario,
-        conflicts: &Conflicts,
-        members: &[VehicleState],
-        order: &mut Vec<u32>,
+        scene: &Scene<'_>,
+        order: &mut Order,
+        means: &mut Means<'_>,
     ) {
-        match policy {
-            PassingOrder::Fifo => {
-                order.clear();
-                order.extend(members.iter().map(|state| state.vehicle));
+        let Scene { scenario, conflicts, slice, .. } = *scene;
+        let members = &slice[slice.iter().take_while(|state| state.has_left()).count()..];
+        if policy == PassingOrder::Fifo {
+            order.vehicles.clear();
+            order.vehicles.extend(members.iter().map(|state| state.vehicle));
+            return;
+        }
+        let is_member = |vehicle: u32| members.iter().any(|state| state.vehicle == vehicle);
+        order.vehicles.retain(|vehicle| is_member(*vehicle));
+        order.passed.retain(|(vehicle, _)| is_member(*vehicle));
+        for state in members {
+            if order.vehicles.contains(&state.vehicle) {
+                continue;
             }
-            PassingOrder::PerPoint => {
-                order.retain(|vehicle| members.iter().any(|state| state.vehicle == *vehicle));
-                for state in members {
-                    if !order.contains(&state.vehicle) {
-                        let place = self.place(scenario, conflicts, members, order, state);
-                        order.insert(place, state.vehicle);
-                    }
-                }
+            if policy == PassingOrder::Resequenced {
+                self.insert_where_cheapest(scene, members, order, state, means);
+            } else {
+                let place = self.place(scenario, conflicts, members, &order.vehicles, state);
+                order.vehicles.insert(place, state.vehicle);
             }
         }
+    }
+
+    /// Puts a newcomer where the schedule of all costs least: at the end of the order, or ahead of up to three others that
+    /// it meets, each of which is far enough from where they meet, was not passed twice in this zone before, and can let
+    /// it pass; and the newcomer can let those ahead of it.
+    ///
+    /// Whom it does not meet, it goes ahead of without their being passed: nothing changes for them.
+    fn insert_where_cheapest(
+        &mut self,
+        scene: &Scene<'_>,
+        members: &[VehicleState],
+        order: &mut Order,
+        newcomer: &VehicleState,
+        Means { assigner, scheduler }: &mut Means<'_>,
+    ) {
+        self.find_places(scene, members, order, newcomer);
+        let end = order.vehicles.len();
+        let Orders { tried, places, .. } = self;
+        let (mut best, mut least) = (end, f64::INFINITY);
+        for &place in places.iter().filter(|_| places.len() > 1) {
+            tried.clear();
+            tried.extend_from_slice(&order.vehicles);
+            tried.insert(place, newcomer.vehicle);
+            assigner.derive(scene, tried);
+            let cost = scheduler.cost(scene, &assigner.queue());
+            // The end of the order comes first, and must be undercut by something.
+            let handicap = if place == end { 0.0 } else { LEAST_GAIN };
+            if cost + handicap < least {
+                (best, least) = (place, cost + handicap);
+            }
+        }
+        let first = row(scene.scenario, newcomer, 0);
+        for at in best..end {
+            let vehicle = order.vehicles[at];
+            let Some(state) = members.iter().find(|state| state.vehicle == vehicle) else { continue };
+            if meeting(scene.conflicts, &first, &row(scene.scenario, state, 1)) != Meeting::Nowhere {
+                order.is_passed(vehicle);
+            }
+        }
+        order.vehicles.insert(best, newcomer.vehicle);
+    }
+
+    /// The places at which a newcomer may be put, the end of the order first.
+    fn find_places(
+        &mut self,
+        scene: &Scene<'_>,
+        members: &[VehicleState],
+        order: &Order,
+        newcomer: &VehicleState,
+    ) {
+        let Scene { scenario, conflicts, .. } = *scene;
+        let first = row(scenario, newcomer, 0);
+        let state_of = |vehicle: u32| members.iter().find(|state| state.vehicle == vehicle);
+        self.places.clear();
+        self.places.push(order.vehicles.len());
+        let mut forward = 0;
+        for (at, &vehicle) in order.vehicles.iter().enumerate().rev() {
+            let Some(state) = state_of(vehicle) else { continue };
+            let second = row(scenario, state, 1);
+            match meeting(conflicts, &first, &second) {
+                Meeting::Nowhere => continue,
+                Meeting::OnALane => break,
+                Meeting::AtPoints => {}
+            }
+            let uses = conflicts.uses(second.path).iter();
+            let mut shared = uses.filter(|u| conflicts.uses(first.path).iter().any(|o| o.point == u.point));
+            let is_far = shared.all(|u| u.at_m - second.x_m >= LEAST_BEFORE_POINT_M);
+            if !is_far || order.times_passed(vehicle) >= MOST_PASSED || forward == MOST_FORWARD {
+                break;
+            }
+            if self.slack_m(conflicts, state.kind, &first, &second) < YIELDING_SLACK_M {
+                break;
+            }
+            forward += 1;
+            // Behind whom it is then, of those it meets.
+            let before = order.vehicles[..at].iter().rev().filter_map(|&vehicle| state_of(vehicle));
+            let mut before = before.map(|state| row(scenario, state, 0));
+            let ahead = before.find(|ahead| meeting(conflicts, &first, ahead) != Meeting::Nowhere);
+            let own = Row { id: 1, ..first };
+            let can_follow = ahead
+                .is_none_or(|ahead| self.slack_m(conflicts, newcomer.kind, &ahead, &own) >= YIELDING_SLACK_M);
+            if can_follow {
+                self.places.push(at);
+            }
+        }
+    }
+
+    /// By how much the second can let the first pass, m.
+    fn slack_m(&mut self, conflicts: &Conflicts, kind: u16, first: &Row, second: &Row) -> f64 {
+        let shield = &self.shields[usize::from(kind).min(self.shields.len() - 1)];
+        yielding_slack_m(shield, conflicts, &mut self.duties, first, second)
     }
 
     /// Where a newcomer goes: before everybody at the end of the order whom it does not meet, or who would reach
@@ -69,7 +210,7 @@ impl Orders {
         for (at, vehicle) in order.iter().enumerate().rev() {
             let Some(state) = members.iter().find(|state| state.vehicle == *vehicle) else { continue };
             let second = row(scenario, state, 1);
-            match self.meets(conflicts, &first, &second) {
+            match meeting(conflicts, &first, &second) {
                 Meeting::Nowhere => continue,
                 Meeting::OnALane => break,
                 Meeting::AtPoints => {}
@@ -78,28 +219,27 @@ impl Orders {
                 let theirs = conflicts.uses(second.path).iter().find(|u| u.point == own.point);
                 theirs.is_none_or(|theirs| expected_s(newcomer, own.at_m) < expected_s(state, theirs.at_m))
             });
-            let shield = &self.shields[usize::from(state.kind).min(self.shields.len() - 1)];
-            let mut slack_m = || yielding_slack_m(shield, conflicts, &mut self.duties, &first, &second);
-            if !comes_first || slack_m() < YIELDING_SLACK_M {
+            if !comes_first || self.slack_m(conflicts, state.kind, &first, &second) < YIELDING_SLACK_M {
                 break;
             }
             place = at;
         }
         place
     }
+}
 
-    fn meets(&mut self, conflicts: &Conflicts, first: &Row, second: &Row) -> Meeting {
-        let mut on_a_lane = false;
-        conflicts.runs((second.path, second.next_path), (first.path, first.next_path), |run| {
-            on_a_lane |= run.from_m == 0.0 && run.other_from_m == 0.0;
-        });
-        let shares =
-            |own: &crate::conflict::Use| conflicts.uses(second.path).iter().any(|u| u.point == own.point);
-        match (on_a_lane, conflicts.uses(first.path).iter().any(shares)) {
-            (true, _) => Meeting::OnALane,
-            (false, true) => Meeting::AtPoints,
-            (false, false) => Meeting::Nowhere,
-        }
+/// Where two vehicles meet.
+fn meeting(conflicts: &Conflicts, first: &Row, second: &Row) -> Meeting {
+    let mut on_a_lane = false;
+    conflicts.runs((second.path, second.next_path), (first.path, first.next_path), |run| {
+        on_a_lane |= run.from_m == 0.0 && run.other_from_m == 0.0;
+    });
+    let shares =
+        |own: &crate::conflict::Use| conflicts.uses(second.path).iter().any(|u| u.point == own.point);
+    match (on_a_lane, conflicts.uses(first.path).iter().any(shares)) {
+        (true, _) => Meeting::OnALane,
+        (false, true) => Meeting::AtPoints,
+        (false, false) => Meeting::Nowhere,
     }
 }
 

@@ -1,35 +1,95 @@
 //! What a zone tells its neighbours at its events.
 
 use super::flow::segment_m;
-use crate::scenario::{Network, ZoneId};
-use ipc_schemas::{STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState, ZoneSummary};
+use crate::scenario::{Scenario, ScheduleKind, ZoneId};
+use ipc_schemas::{
+    NO_PATH, NO_VEHICLE, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, SUMMARY_COMING, VehicleState, ZoneSummary,
+};
 
 /// Whom a zone tells about itself.
 #[derive(Clone, Debug)]
-pub struct Audience(
-    /// Each neighbour, and the length of the segment of this zone it observes, m.
-    Vec<(ZoneId, f64)>,
-);
+pub struct Audience {
+    neighbours: Vec<Neighbour>,
+    /// How far it is from the origin of each path to the zone behind it, m.
+    onward_m: Vec<f64>,
+    /// Whether neighbours are told of each vehicle.
+    in_detail: bool,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Neighbour {
+    zone: ZoneId,
+    /// Length of the segment of this zone it observes, m.
+    segment_m: f64,
+    /// Whether vehicles come from there.
+    is_upstream: bool,
+}
 
 impl Audience {
     /// The audience of a zone.
-    pub fn of(network: &Network, zone: ZoneId) -> Audience {
+    pub fn of(scenario: &Scenario, zone: ZoneId) -> Audience {
+        let network = &scenario.network;
         let neighbours = network.neighbours(zone).map(|n| {
             // Only policies of exits that lead here look into this zone; of several the one that looks furthest.
             let exits = network.zones[n as usize].exits.iter();
             let looking = exits.filter(|exit| exit.to.is_some_and(|to| to.zone == zone));
-            (n, looking.map(|exit| segment_m(&exit.flow)).fold(0.0, f64::max))
+            let is_upstream = network.upstream(zone).any(|upstream| upstream == n);
+            let segment_m = looking.map(|exit| segment_m(&exit.flow)).fold(0.0, f64::max);
+            Neighbour { zone: n, segment_m, is_upstream }
         });
-        Audience(neighbours.collect())
+        let own = &network.zones[zone as usize];
+        let link_m = |path| own.exit_of(path).to.map_or(0.0, |to| to.link_m);
+        let onward_m = (0..).zip(&own.paths).map(|(index, path)| path.length_m + link_m(index));
+        Audience {
+            neighbours: neighbours.collect(),
+            onward_m: onward_m.collect(),
+            in_detail: scenario.coordination.schedule == ScheduleKind::Tandem,
+        }
     }
 
-    /// What each is told of the zone's S(t).
+    /// What each is told of the zone's S(t): a group of records per neighbour.
     pub fn summaries<'a>(
         &'a self,
         zone: ZoneId,
         slice: &'a [VehicleState],
     ) -> impl Iterator<Item = ZoneSummary> + 'a {
-        self.0.iter().map(move |&(neighbour, segment_m)| summarise(zone, neighbour, segment_m, slice))
+        self.neighbours.iter().flat_map(move |neighbour| {
+            let all = summarise(zone, neighbour, slice);
+            let in_detail = move |state: &'a VehicleState| self.vehicle(neighbour, state, all);
+            let members = slice.iter().filter(|state| self.in_detail && !state.has_left());
+            let mut vehicles = members.flat_map(in_detail).peekable();
+            let none = vehicles.peek().is_none().then_some(all);
+            vehicles.chain(none)
+        })
+    }
+
+    /// A member, as a neighbour is told of it: one that goes there, and one ahead of those from there.
+    fn vehicle(
+        &self,
+        neighbour: &Neighbour,
+        state: &VehicleState,
+        all: ZoneSummary,
+    ) -> impl Iterator<Item = ZoneSummary> + use<> {
+        let told = ZoneSummary {
+            x_m: state.x_m,
+            v_mps: state.v_mps,
+            planned_exit_time_s: state.planned_exit_time_s,
+            planned_exit_speed_mps: state.planned_exit_speed_mps,
+            vehicle: state.vehicle,
+            path: state.path,
+            next_path: state.next_path,
+            kind: state.kind,
+            ..all
+        };
+        let comes = state.next_zone == neighbour.zone;
+        let coming = ZoneSummary {
+            x_m: state.x_m - self.onward_m[state.path as usize],
+            path: state.next_path,
+            next_path: state.then_path,
+            flags: SUMMARY_COMING,
+            ..told
+        };
+        comes.then_some(coming).into_iter().chain(neighbour.is_upstream.then_some(told))
     }
 }
 
@@ -38,7 +98,8 @@ pub fn is_event(slice: &[VehicleState]) -> bool {
     slice.iter().any(|s| s.flags & (STATE_ENTERED | STATE_LEFT_NOW) != 0)
 }
 
-fn summarise(zone: ZoneId, to_zone: ZoneId, segment_m: f64, slice: &[VehicleState]) -> ZoneSummary {
+fn summarise(zone: ZoneId, neighbour: &Neighbour, slice: &[VehicleState]) -> ZoneSummary {
+    let segment_m = neighbour.segment_m;
     let members = slice.iter().filter(|s| s.flags & STATE_LEFT == 0);
     let (mut vehicles, mut segment_vehicles, mut speed_sum) = (0, 0, 0.0);
     for state in members {
@@ -56,8 +117,12 @@ fn summarise(zone: ZoneId, to_zone: ZoneId, segment_m: f64, slice: &[VehicleStat
             0.0
         },
         from_zone: zone,
-        to_zone,
+        to_zone: neighbour.zone,
         vehicles,
         segment_vehicles,
+        vehicle: NO_VEHICLE,
+        path: NO_PATH,
+        next_path: NO_PATH,
+        ..ZoneSummary::default()
     }
 }

@@ -85,7 +85,7 @@ where
 
     /// Goes on from what another has left.
     pub fn take_over(&mut self, handover: Handover) {
-        self.coordinator.restore(&handover.downstream, &handover.due, &handover.in_force);
+        self.coordinator.restore(&handover.heard, &handover.due, &handover.in_force);
         self.handed_over = Some(handover.step);
         let zones = self.coordinator.zones();
         let owes = handover.summarised >> self.identity.index & 1 == 1;

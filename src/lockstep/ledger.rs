@@ -29,8 +29,8 @@ pub struct Handover {
     pub commands: Vec<VehicleCommand>,
     /// Assignments in force before that step, by zone.
     pub in_force: Vec<Assignment>,
-    /// To a coordinator: the last summaries its zones acted on.
-    pub downstream: Vec<ZoneSummary>,
+    /// To a coordinator: the last summaries of each neighbour its zones acted on.
+    pub heard: Vec<ZoneSummary>,
     /// To a coordinator: the summaries sent in the step before.
     pub due: Vec<ZoneSummary>,
     /// To a coordinator: the summaries of that step, for the next one.
@@ -62,8 +62,8 @@ impl Handover {
 pub struct Ledger {
     audiences: Vec<Audience>,
     in_force: Vec<Vec<Assignment>>,
-    /// Per zone, the last summary of each zone downstream it acted on.
-    downstream: Vec<Vec<(u32, Option<ZoneSummary>)>>,
+    /// Per zone, the last summaries of each neighbour it acted on.
+    heard: Vec<Vec<(u32, Vec<ZoneSummary>)>>,
     due: Vec<ZoneSummary>,
     fresh: Vec<ZoneSummary>,
     coordination: Vec<(u16, Vec<Assignment>)>,
@@ -83,10 +83,10 @@ impl Ledger {
         let zones = network.zones.len();
         let none = || vec![Vec::new(); controllers as usize];
         Ledger {
-            audiences: (0..zones as u32).map(|zone| Audience::of(network, zone)).collect(),
+            audiences: (0..zones as u32).map(|zone| Audience::of(scenario, zone)).collect(),
             in_force: vec![Vec::new(); zones],
-            downstream: (0..zones as u32)
-                .map(|zone| network.downstream(zone).map(|next| (next, None)).collect())
+            heard: (0..zones as u32)
+                .map(|zone| network.neighbours(zone).map(|next| (next, Vec::new())).collect())
                 .collect(),
             due: Vec::new(),
             fresh: Vec::new(),
@@ -101,12 +101,14 @@ impl Ledger {
     /// A step begins with this state.
     pub fn begin(&mut self, states: &[VehicleState], is_event_step: bool) {
         self.has_begun = true;
-        for summary in self.due.drain(..) {
-            let known = self.downstream[summary.to_zone as usize].iter_mut();
-            for (_, last) in known.filter(|(zone, _)| *zone == summary.from_zone) {
-                *last = Some(summary);
+        for group in self.due.chunk_by(is_of_one) {
+            let known = self.heard[group[0].to_zone as usize].iter_mut();
+            for (_, last) in known.filter(|(zone, _)| *zone == group[0].from_zone) {
+                last.clear();
+                last.extend_from_slice(group);
             }
         }
+        self.due.clear();
         std::mem::swap(&mut self.due, &mut self.fresh);
         if is_event_step {
             for slice in states.chunk_by(|a, b| a.zone == b.zone) {
@@ -200,24 +202,20 @@ impl Ledger {
     }
 
     fn to_coordinator(&self) -> Handover {
-        let downstream = self.downstream.iter().flatten().filter_map(|(_, last)| *last);
+        let heard = self.heard.iter().flatten().flat_map(|(_, last)| last.iter().copied());
         let in_force = self.in_force.concat();
         if self.has_begun {
             let (due, fresh) = (self.due.clone(), self.fresh.clone());
-            return Handover {
-                downstream: downstream.collect(),
-                due,
-                fresh,
-                in_force,
-                ..Handover::default()
-            };
+            return Handover { heard: heard.collect(), due, fresh, in_force, ..Handover::default() };
         }
         // What was due in the last step has been acted on, and what was fresh is due.
-        let is_downstream = |s: &&ZoneSummary| {
-            self.downstream[s.to_zone as usize].iter().any(|(zone, _)| *zone == s.from_zone)
-        };
-        let acted_on = self.due.iter().filter(is_downstream);
-        let downstream = downstream.chain(acted_on.copied()).collect();
-        Handover { downstream, due: self.fresh.clone(), in_force, ..Handover::default() }
+        let is_older = |told: &ZoneSummary| !self.due.iter().any(|newer| is_of_one(told, newer));
+        let heard = heard.filter(is_older).chain(self.due.iter().copied()).collect();
+        Handover { heard, due: self.fresh.clone(), in_force, ..Handover::default() }
     }
+}
+
+/// Whether two summaries tell one zone about one other.
+fn is_of_one(a: &ZoneSummary, b: &ZoneSummary) -> bool {
+    (a.from_zone, a.to_zone) == (b.from_zone, b.to_zone)
 }

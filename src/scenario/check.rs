@@ -56,6 +56,8 @@ impl Scenario {
         ] {
             within(what, gain, &ranges::GAIN)?;
         }
+        within("price_of_time", self.coordination.price_of_time, &ranges::PRICE_OF_TIME)?;
+        within("tandem_weight", self.coordination.tandem_weight, &ranges::TANDEM_WEIGHT)?;
         within("slack_weight", control.slack_weight, &ranges::SLACK_WEIGHT)?;
         let viable = &control.viable;
         within("k_comfort_per_s", viable.k_comfort_per_s, &ranges::GAIN)?;
@@ -287,6 +289,10 @@ fn flow(exit: &Exit, network: &Network, v_max_mps: f64) -> Check {
                 Observed::Whole => Ok(()),
                 Observed::First(l) => observes(*l),
             }
+        }
+        FlowPolicy::Predicted { min_mps } => {
+            has_downstream()?;
+            speed("min_mps", *min_mps)
         }
         FlowPolicy::MeanSpeed { offset_mps, gain_mps, segment_m, min_mps } => {
             has_downstream()?;

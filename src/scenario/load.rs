@@ -157,6 +157,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         "objective",
         "control",
         "gate",
+        "coordination",
         "shield",
         "fleet",
         "roads",
@@ -178,6 +179,8 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let beta = sections::beta(&objective, &vehicle)?;
     let control_table = section("control")?;
     let control = sections::control(control_table.as_ref(), beta)?;
+    let coordination_table = section("coordination")?;
+    let (coordination, order) = sections::coordination(coordination_table.as_ref())?;
     let fleet = sections::fleet(&root, &vehicle)?;
 
     let road_tables = root.tables("roads", "a list of entry roads, at least one")?;
@@ -198,7 +201,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         &road_tables,
         &road_names,
         (step_m, vehicle.v_max_mps),
-        law,
+        (law, order),
     )?;
 
     flow_policies(&zone_tables, &mut topology, &vehicle)?;
@@ -237,6 +240,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         fleet,
         vehicle,
         control,
+        coordination,
         beta,
         plugins,
         shield,

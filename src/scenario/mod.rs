@@ -35,8 +35,8 @@ pub use network::{
     Source, Zone, ZoneId,
 };
 pub use params::{
-    Baseline, ControlParams, FeConditions, FlowPolicy, Observed, PositionFeedback, ReferenceLaw, Replan,
-    SafetyRows, Solver, VehicleKind, VehicleParams, ViableParams,
+    Baseline, ControlParams, CoordinationParams, FeConditions, FlowPolicy, Observed, PositionFeedback,
+    ReferenceLaw, Replan, SafetyRows, ScheduleKind, Solver, VehicleKind, VehicleParams, ViableParams,
 };
 pub use plugins::{ControllerNames, Drivers, Plugin, ShieldMode};
 
@@ -64,6 +64,8 @@ pub struct Scenario {
     pub fleet: Vec<VehicleKind>,
     /// The controllers' law.
     pub control: ControlParams,
+    /// What coordinators do beside assigning duties.
+    pub coordination: CoordinationParams,
     /// Weight of time against energy, m^2/s^4 (paper: beta in `eqn:energyobj`).
     pub beta: f64,
     /// Controllers written elsewhere; the built-in pool drives the rest.

@@ -122,6 +122,8 @@ pub enum PassingOrder {
     Fifo,
     /// In order of expected arrival, conflict point by conflict point.
     PerPoint,
+    /// In order of entry, but a newcomer goes ahead of up to three others where that lowers the cost of the schedule.
+    Resequenced,
 }
 
 /// A law of the built-in controllers.

@@ -170,6 +170,37 @@ impl ViableParams {
     };
 }
 
+/// Whether coordinators schedule the instants at which vehicles leave their zone.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ScheduleKind {
+    /// They do not.
+    #[default]
+    None,
+    /// At least cost over the vehicles of the zone.
+    Pooled,
+    /// At least cost over the vehicles of the zone and of its neighbours, over this zone and the next.
+    Tandem,
+}
+
+/// What coordinators do beside assigning duties.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct CoordinationParams {
+    /// Whether they schedule.
+    pub schedule: ScheduleKind,
+    /// What a second costs those who are not there yet, as a share of what it costs the vehicle itself: the last
+    /// vehicle weighs time with 1 + this, the others with 1 + 0.3 of this.
+    pub price_of_time: f64,
+    /// Weight omega of the next zone's cost beside this one's, in (0, 1].
+    pub tandem_weight: f64,
+}
+
+impl CoordinationParams {
+    /// No schedules.
+    pub const DEFAULT: CoordinationParams =
+        CoordinationParams { schedule: ScheduleKind::None, price_of_time: 0.7, tandem_weight: 0.3 };
+}
+
 /// Baseline speed v_b of a feedback policy.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub enum Baseline {
@@ -217,6 +248,11 @@ pub enum FlowPolicy {
         gain_mps: f64,
         /// Length l, m.
         segment_m: f64,
+        /// v_m is not set lower, m/s.
+        min_mps: f64,
+    },
+    /// v_m minimises the objective that is foretold (paper: Problem 2).
+    Predicted {
         /// v_m is not set lower, m/s.
         min_mps: f64,
     },

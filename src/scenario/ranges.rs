@@ -59,6 +59,10 @@ pub(super) const FLOW_SPEED: Range = range("a speed", 0.01, 1000.0, "m/s");
 pub(super) const FLOW_GAIN: Range = range("a gain", 0.0, 1000.0, "m/s per vehicle");
 /// `offset_mps` of a flow policy.
 pub(super) const FLOW_OFFSET: Range = range("a speed difference", -1000.0, 1000.0, "m/s");
+/// `coordination.price_of_time`.
+pub(super) const PRICE_OF_TIME: Range = range("a share", 0.0, 100.0, "");
+/// `coordination.tandem_weight`.
+pub(super) const TANDEM_WEIGHT: Range = range("a weight", 0.01, 1.0, "");
 /// `min_headway_s` of random arrivals.
 pub(super) const HEADWAY: Range = range("a time", 0.0, 1e6, "s");
 

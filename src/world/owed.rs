@@ -102,7 +102,9 @@ impl World {
                 known.push(car.vehicle);
             }
         }
-        let Some(proposed) = proposed.take().filter(|proposed| proposed != known) else { return };
+        // Of an empty zone nobody says anything new; what was said before means nothing any more.
+        let proposed = proposed.take().filter(|proposed| proposed != known && !known.is_empty());
+        let Some(proposed) = proposed else { return };
         let car = |vehicle: u32| members.iter().find(|car| car.vehicle == vehicle);
         let is_whole =
             proposed.len() == known.len() && proposed.iter().all(|vehicle| known.contains(vehicle));

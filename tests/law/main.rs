@@ -60,6 +60,7 @@ fn scenario() -> Scenario {
             fe_fraction: 0.25,
             viable: ViableParams::DEFAULT,
         },
+        coordination: control_zones::scenario::CoordinationParams::DEFAULT,
         beta: 2.0 / 3.0,
         faults: None,
         plugins: Vec::new(),

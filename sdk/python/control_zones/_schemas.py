@@ -11,7 +11,7 @@ import ctypes
 import sys
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0x2291d52fc5522958
+SCHEMA_HASH = 0xf214663ee06bf4cd
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -57,6 +57,15 @@ CONSTRAINT_CROSS = 3
 NO_POINT = 4294967295
 #: `Assignment.flags`: the terminal speed is free; `terminal_speed_mps` is 0 and means nothing.
 ASSIGNMENT_FREE_TERMINAL = 1
+#: `Assignment.flags`: how often the vehicle was passed in its zone by others that entered later, in
+#: units of `ASSIGNMENT_PASSED_ONCE`.
+ASSIGNMENT_PASSED = 6
+#: `Assignment.flags`: the unit of `ASSIGNMENT_PASSED`.
+ASSIGNMENT_PASSED_ONCE = 2
+
+#: `ZoneSummary.flags`: the vehicle is in the zone that is described and goes to the one that is
+#: told; without it, it is ahead of those that come from the zone that is told.
+SUMMARY_COMING = 1
 
 #: `VehicleCommand.mode`: entered, not yet decided on (never sent by the built-in law).
 MODE_ENTERED = 0
@@ -302,7 +311,8 @@ class Assignment(ctypes.Structure):
         point: Index of the conflict point within the zone, or `NO_POINT`.
         rank: Place of the vehicle in the zone's passing order, from 0.
         kind: 0 none, 1 rear end, 2 merge, 3 cross.
-        flags: Bit 0: the terminal speed is free.
+        flags: Bit 0: the terminal speed is free; bits 1 and 2: how often the vehicle was passed in
+            its zone.
     """
 
     _fields_ = [
@@ -332,30 +342,54 @@ class ZoneSummary(ctypes.Structure):
     """A zone's traffic, told to one neighbour at the zone's own events.
 
     Sent in step `k`, acted upon in step `k + 1`, whether or not both zones live in one process.
+    Where zones schedule in tandem, there is a record for each vehicle that concerns the neighbour:
+    those that go there, and, for those from there, those ahead of them; in order of entry.
+    Otherwise, and when there are none, it is one record with `vehicle = NO_VEHICLE`. What is not
+    about the vehicle is the same in all.
 
     Fields:
         segment_m: Length l of the first segment the neighbour asked about, m.
         segment_mean_speed_mps: Mean speed of the vehicles in that segment, m/s (0 when it is
             empty).
+        x_m: Position of the vehicle on its path in the downstream one of the two zones, m; negative
+            before its origin.
+        v_mps: Its speed, m/s.
+        planned_exit_time_s: Instant at which it plans to leave the zone that is described, s (0
+            when it has no plan).
+        planned_exit_speed_mps: Speed at that instant, m/s.
         from_zone: Zone that is described.
         to_zone: Zone that is told.
         vehicles: Number of vehicles in the zone, N.
         segment_vehicles: Number of them within the first segment, N(l).
+        vehicle: A vehicle, or `NO_VEHICLE`.
+        path: Its path in the downstream one of the two zones.
+        next_path: Its path in the zone after that, or `NO_PATH`.
+        kind: Its kind: index in the scenario's fleet.
+        flags: Bit 0: the vehicle comes to the zone that is told.
     """
 
     _fields_ = [
         ("segment_m", ctypes.c_double),
         ("segment_mean_speed_mps", ctypes.c_double),
+        ("x_m", ctypes.c_double),
+        ("v_mps", ctypes.c_double),
+        ("planned_exit_time_s", ctypes.c_double),
+        ("planned_exit_speed_mps", ctypes.c_double),
         ("from_zone", ctypes.c_uint32),
         ("to_zone", ctypes.c_uint32),
         ("vehicles", ctypes.c_uint32),
         ("segment_vehicles", ctypes.c_uint32),
+        ("vehicle", ctypes.c_uint32),
+        ("path", ctypes.c_uint32),
+        ("next_path", ctypes.c_uint32),
+        ("kind", ctypes.c_uint16),
+        ("flags", ctypes.c_uint16),
     ]
 
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
-        return "cz.ZoneSummary.v1"
+        return "cz.ZoneSummary.v2"
 
 
 class VehicleCommand(ctypes.Structure):
@@ -673,7 +707,7 @@ TYPE_NAMES = {
     "FrameHeader": "cz.FrameHeader.v1",
     "VehicleState": "cz.VehicleState.v2",
     "Assignment": "cz.Assignment.v3",
-    "ZoneSummary": "cz.ZoneSummary.v1",
+    "ZoneSummary": "cz.ZoneSummary.v2",
     "VehicleCommand": "cz.VehicleCommand.v2",
     "Member": "cz.Member.v1",
     "AttachRequest": "cz.AttachRequest.v1",
@@ -746,15 +780,24 @@ _LAYOUTS = {
         },
     ),
     ZoneSummary: (
-        32,
+        80,
         8,
         {
             "segment_m": 0,
             "segment_mean_speed_mps": 8,
-            "from_zone": 16,
-            "to_zone": 20,
-            "vehicles": 24,
-            "segment_vehicles": 28,
+            "x_m": 16,
+            "v_mps": 24,
+            "planned_exit_time_s": 32,
+            "planned_exit_speed_mps": 40,
+            "from_zone": 48,
+            "to_zone": 52,
+            "vehicles": 56,
+            "segment_vehicles": 60,
+            "vehicle": 64,
+            "path": 68,
+            "next_path": 72,
+            "kind": 76,
+            "flags": 78,
         },
     ),
     VehicleCommand: (

@@ -3,8 +3,9 @@
 use super::error::ScenarioError;
 use super::table::Table;
 use crate::scenario::{
-    Baseline, ControlParams, EntryRule, FeConditions, FlowPolicy, LawKind, Observed, PositionFeedback,
-    ReferenceLaw, Replan, SafetyRows, Solver, VehicleKind, VehicleParams, ViableParams, ranges,
+    Baseline, ControlParams, CoordinationParams, EntryRule, FeConditions, FlowPolicy, LawKind, Observed,
+    PassingOrder, PositionFeedback, ReferenceLaw, Replan, SafetyRows, ScheduleKind, Solver, VehicleKind,
+    VehicleParams, ViableParams, ranges,
 };
 
 /// No more kinds of vehicles than this.
@@ -222,6 +223,33 @@ fn viable(t: &Table<'_>) -> Result<ViableParams, ScenarioError> {
     })
 }
 
+/// `[coordination]`, or the defaults, and the passing order of zones that name none.
+pub(super) fn coordination(
+    table: Option<&Table<'_>>,
+) -> Result<(CoordinationParams, PassingOrder), ScenarioError> {
+    let mut params = CoordinationParams::DEFAULT;
+    let Some(t) = table else { return Ok((params, PassingOrder::default())) };
+    t.only(&["schedule", "price_of_time", "tandem_weight", "order"])?;
+    params.schedule = t.choice_or_first(
+        "schedule",
+        &[("none", ScheduleKind::None), ("pooled", ScheduleKind::Pooled), ("tandem", ScheduleKind::Tandem)],
+    )?;
+    params.price_of_time = t.within_or("price_of_time", params.price_of_time, &ranges::PRICE_OF_TIME)?;
+    params.tandem_weight = t.within_or("tandem_weight", params.tandem_weight, &ranges::TANDEM_WEIGHT)?;
+    Ok((params, order(t, PassingOrder::default())?))
+}
+
+/// `order` of a table.
+pub(super) fn order(t: &Table<'_>, default: PassingOrder) -> Result<PassingOrder, ScenarioError> {
+    t.get("order").map_or(Ok(default), |field| {
+        field.choice(&[
+            ("fifo", PassingOrder::Fifo),
+            ("per_point", PassingOrder::PerPoint),
+            ("resequenced", PassingOrder::Resequenced),
+        ])
+    })
+}
+
 /// What a zone's policy can observe: the lengths of the approaches of the zone downstream, if there is one.
 pub(super) struct Downstream<'a> {
     pub(super) zone: &'a str,
@@ -240,6 +268,7 @@ pub(super) fn flow(
         Fixed,
         Feedback,
         MeanSpeed,
+        Predicted,
     }
     let Some(field) = zone.get("flow") else { return Ok(FlowPolicy::None) };
     const POLICY: &str = "a table such as {policy = \"fixed\", terminal_mps = 15}";
@@ -256,12 +285,13 @@ pub(super) fn flow(
     ];
     // Without a policy the other keys cannot be judged; a misspelt "policy" is still found here.
     t.only(&all)?;
-    let policy = t.need("policy", "\"none\", \"fixed\", \"feedback\" or \"mean_speed\"")?;
+    let policy = t.need("policy", "\"none\", \"fixed\", \"feedback\", \"mean_speed\" or \"predicted\"")?;
     let kind = policy.choice(&[
         ("none", Kind::None),
         ("fixed", Kind::Fixed),
         ("feedback", Kind::Feedback),
         ("mean_speed", Kind::MeanSpeed),
+        ("predicted", Kind::Predicted),
     ])?;
     let known: &[&str] = match kind {
         Kind::None => &["policy"],
@@ -269,6 +299,7 @@ pub(super) fn flow(
         Kind::Feedback => {
             &["policy", "baseline_mps", "baseline_entry_speeds_mps", "gain_mps", "segment_m", "min_mps"]
         }
+        Kind::Predicted => &["policy", "min_mps"],
         Kind::MeanSpeed => &["policy", "offset_mps", "gain_mps", "segment_m", "min_mps"],
     };
     t.only_or_stale(known, if policy.is_set() { &all } else { &[] })?;
@@ -286,6 +317,9 @@ pub(super) fn flow(
         let problem = "the zone's exit leads out of the network, there is nothing to observe".to_owned();
         return Err(policy.bad_because(Some(problem), "\"none\" or \"fixed\""));
     };
+    if kind == Kind::Predicted {
+        return Ok(FlowPolicy::Predicted { min_mps: t.f64_or("min_mps", 5.0, is_speed, &speed)? });
+    }
     let longest = downstream.longest_m;
     let segment_ok = |l| l > 0.0 && l <= longest;
     let segment = format!(

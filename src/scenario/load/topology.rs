@@ -54,12 +54,12 @@ pub(super) fn read(
     roads: &[Table<'_>],
     road_names: &[&str],
     (step_m, v_max_mps): (f64, f64),
-    law: LawKind,
+    (law, order): (LawKind, PassingOrder),
 ) -> Result<Topology, ScenarioError> {
     // What zones have inside comes first, so that sources may name exits of any zone.
     let mut shapes = Vec::with_capacity(zones.len());
     for (table, name) in zones.iter().zip(zone_names) {
-        shapes.push(zone(table, name, step_m, law)?);
+        shapes.push(zone(table, name, step_m, (law, order))?);
     }
     let exit_names: Vec<Vec<String>> =
         shapes.iter().map(|s| s.zone.exits.iter().map(|e| e.name.clone()).collect()).collect();
@@ -121,9 +121,13 @@ struct Shape<'a> {
     entrances: Vec<(usize, Table<'a>)>,
 }
 
-fn zone<'a>(table: &Table<'a>, name: &str, step_m: f64, law: LawKind) -> Result<Shape<'a>, ScenarioError> {
-    let order = table
-        .choice_or_first("order", &[("fifo", PassingOrder::Fifo), ("per_point", PassingOrder::PerPoint)])?;
+fn zone<'a>(
+    table: &Table<'a>,
+    name: &str,
+    step_m: f64,
+    (law, order): (LawKind, PassingOrder),
+) -> Result<Shape<'a>, ScenarioError> {
+    let order = sections::order(table, order)?;
     let zone = Zone {
         name: name.to_owned(),
         segments: Vec::new(),
