@@ -215,12 +215,7 @@ fn attach_requests_that_contradict_themselves_are_refused_and_end_nothing() {
     let run: RunName = name.parse().unwrap();
     {
         let space = RunSpace::enter(&run).unwrap();
-        let mut line = None;
-        wait_until("the attach desk", || {
-            line = space.open_attach_line().ok();
-            line.is_some()
-        });
-        let line = line.unwrap();
+        let line = common::attach_line(&space);
         let good = AttachRequest {
             instance: 1,
             schema_hash: schema_hash(),
@@ -320,7 +315,7 @@ fn well_formed_frames_of_a_process_without_a_place_steer_nobody() {
     });
     let mut onlooker = Onlooker { blocks: blocks.unwrap(), seen: None };
     // Nobody but the world sends states, or says who has which place, from before anybody can join.
-    wait_until("the attach desk", || space.open_attach_line().is_ok());
+    drop(common::attach_line(&space));
     let own_state = format!("{SERVICE_COORDINATOR_STATE_PREFIX}0");
     for service in [SERVICE_STATE, &own_state] {
         let service = space.open::<VehicleState>(service).unwrap();

@@ -5,14 +5,14 @@
 
 use control_zones::control::ControllerPool;
 use control_zones::coordination::Coordinator;
-use control_zones::lockstep::in_process::InProcess;
+use control_zones::lockstep::in_process::{ControllerSide, CoordinatorSide, InProcess, WorldSide};
 use control_zones::lockstep::{
     ControllerDriver, ControllerPorts, CoordinatorDriver, CoordinatorPorts, Handover, Identity, Members,
     Progress, Seat, WorldDriver, WorldPorts,
 };
 use control_zones::scenario::share::{neighbour_coordinators, zones_of};
 use control_zones::scenario::{Override, Scenario, load};
-use control_zones::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
+use control_zones::transport::memory::{MemoryOutbox, MemoryService};
 use control_zones::transport::{Backlog, Loan, Outbox, Slots};
 use control_zones::world::World;
 use ipc_schemas::{Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
@@ -24,26 +24,6 @@ const COORDINATORS: u32 = 3;
 const CONTROLLERS: u32 = 2;
 const RUN_ID: u64 = 7;
 const WORLD: u32 = 1;
-
-type WorldSide = WorldDriver<
-    MemoryOutbox<VehicleState>,
-    MemoryOutbox<VehicleState>,
-    MemoryInbox<VehicleCommand>,
-    MemoryInbox<Assignment>,
->;
-type CoordinatorSide = CoordinatorDriver<
-    MemoryInbox<VehicleState>,
-    MemoryInbox<ZoneSummary>,
-    MemoryOutbox<ZoneSummary>,
-    MemoryOutbox<Assignment>,
-    MemoryInbox<Member>,
->;
-type ControllerSide = ControllerDriver<
-    MemoryInbox<VehicleState>,
-    MemoryInbox<Assignment>,
-    MemoryOutbox<VehicleCommand>,
-    MemoryInbox<Member>,
->;
 
 #[derive(Debug)]
 enum Driver {

@@ -15,20 +15,23 @@ use crate::world::World;
 use ipc_schemas::{Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::sync::Arc;
 
-type WorldSide = WorldDriver<
+/// The world's driver over the memory transport.
+pub type WorldSide = WorldDriver<
     MemoryOutbox<VehicleState>,
     MemoryOutbox<VehicleState>,
     MemoryInbox<VehicleCommand>,
     MemoryInbox<Assignment>,
 >;
-type CoordinatorSide = CoordinatorDriver<
+/// A coordinator's driver over the memory transport.
+pub type CoordinatorSide = CoordinatorDriver<
     MemoryInbox<VehicleState>,
     MemoryInbox<ZoneSummary>,
     MemoryOutbox<ZoneSummary>,
     MemoryOutbox<Assignment>,
     MemoryInbox<Member>,
 >;
-type ControllerSide = ControllerDriver<
+/// A controller process's driver over the memory transport.
+pub type ControllerSide = ControllerDriver<
     MemoryInbox<VehicleState>,
     MemoryInbox<Assignment>,
     MemoryOutbox<VehicleCommand>,

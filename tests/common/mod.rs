@@ -4,6 +4,7 @@
 #![allow(dead_code)] // every test file uses its part of this
 #![allow(clippy::unwrap_used)] // as in the tests themselves
 
+use control_zones::transport::iox::{AttachLine, RunSpace};
 use rustix::process::{Pid, Signal, kill_process};
 use std::fs::File;
 use std::os::unix::process::ExitStatusExt;
@@ -281,6 +282,16 @@ pub fn example(name: &str) -> String {
 /// Waits for something that must happen soon.
 pub fn wait_until(what: &str, happened: impl FnMut() -> bool) {
     wait_within(LONG, what, happened);
+}
+
+/// The attach service's line, once the run's world has opened it.
+pub fn attach_line(space: &RunSpace) -> AttachLine {
+    let mut line = None;
+    wait_until("the attach service", || {
+        line = space.open_attach_line().ok();
+        line.is_some()
+    });
+    line.unwrap()
 }
 
 /// Waits for something that must happen within that time.
