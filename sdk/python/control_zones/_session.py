@@ -26,6 +26,10 @@ _REPEAT_S = 0.1
 _AT_ONCE = 16
 #: Accounts of refused frames are kept for this many senders; the rest share one.
 _MAX_ACCOUNTS = 16
+#: Process, generation and sending end where there is no coordinator.
+_NOBODY = (None, None, None)
+#: In the place of a fault: the frame is of somebody who had the place before.
+_LATE = "late"
 
 
 class Error(Exception):
@@ -175,6 +179,7 @@ class Session:
         # The services are opened only now, when both sides are known to mean the same by them.
         self._states = self._service_of(s.SERVICE_STATE, s.VehicleState).subscriber_builder().create()
         self._coordination = self._service_of(s.SERVICE_COORDINATION, s.Assignment).subscriber_builder().create()
+        self._members = self._service_of(s.SERVICE_MEMBERS, s.Member).subscriber_builder().create()
         self._commands = (
             self._service_of(s.SERVICE_COMMAND, s.VehicleCommand)
             .publisher_builder()
@@ -195,7 +200,10 @@ class Session:
         self._ask_again_at = None
         self._state = None
         self._complete = False
-        self._world_port = None
+        # Sending ends that have proved to be the world's, by role and service.
+        self._world_ports = set()
+        # Process, generation and proved sending end of each coordinator, as the world says.
+        self._coordinators = {}
         self._refused = {}
         self._restore(*self._exchange(request, deadline, late))
 
@@ -313,14 +321,7 @@ class Session:
                 break
             # Copied before it is judged: what was judged is what is used, and may be kept.
             header = s.FrameHeader.from_buffer_copy(sample.user_header().contents)
-            fault = self._fault(header, sample, s.ROLE_WORLD, s.VehicleState)
-            if fault is None and (header.sender_index, header.generation) != (0, 0):
-                fault = "its sender_index or generation is not the world's"
-            if fault is None and self._world_port != (port := sample.header.publisher_id.value):
-                if (process := _process_of(sample)) != self.reply.world_process_id:
-                    fault = f"it was sent by process {process}; the world is {self.reply.world_process_id}"
-                else:
-                    self._world_port = port
+            fault = self._not_the_world(header, sample)
             if fault is not None:
                 self._refuse(header, sample, fault)
                 continue
@@ -344,9 +345,9 @@ class Session:
                 break
             header = s.FrameHeader.from_buffer_copy(sample.user_header().contents)
             records = _copied(sample, s.Assignment)
-            fault = self._fault(header, sample, s.ROLE_COORDINATOR, s.Assignment)
-            if fault is None and header.sender_index >= min(self.reply.coordinators, 64):
-                fault = f"the run has {self.reply.coordinators} coordinators"
+            fault = self._no_coordinator(header, sample)
+            if fault is _LATE:
+                continue
             foreign = next((r.zone for r in records if r.zone >= self.run.spec.zones), None)
             if fault is None and foreign is not None:
                 fault = f"there is no zone {foreign}"
@@ -375,7 +376,54 @@ class Session:
         self._requests.send_copy(request)
         self._ask_again_at = now + _REPEAT_S
 
-    def _fault(self, header, sample, role, record):
+    def _not_the_world(self, header, sample):
+        """Why a frame is not the world's, if it is not."""
+        fault = self._fault(header, sample, s.ROLE_WORLD)
+        if fault is None and (header.sender_index, header.generation) != (0, 0):
+            fault = "its sender_index or generation is not the world's"
+        if fault is None and (port := sample.header.publisher_id.value) not in self._world_ports:
+            if (process := _process_of(sample)) != self.reply.world_process_id:
+                return f"it was sent by process {process}; the world is {self.reply.world_process_id}"
+            self._world_ports.add(port)
+        return fault
+
+    def _no_coordinator(self, header, sample):
+        """Why a frame is not one of a coordinator of the run, if it is not."""
+        fault = self._fault(header, sample, s.ROLE_COORDINATOR)
+        if fault is not None:
+            return fault
+        port = sample.header.publisher_id.value
+        if self._coordinators.get(header.sender_index, _NOBODY)[2] != port:
+            self._listen()
+        process, generation, known = self._coordinators.get(header.sender_index, _NOBODY)
+        if process is None:
+            return f"the run has no coordinator {header.sender_index}"
+        if header.generation < generation:
+            # What one that has died left; its successor sends the same again.
+            return _LATE
+        if header.generation > generation:
+            return f"it has generation = {header.generation}, expected {generation}"
+        if known != port:
+            if (found := _process_of(sample)) != process:
+                return f"it was sent by process {found}; coordinator {header.sender_index} is {process}"
+            self._coordinators[header.sender_index] = process, generation, port
+        return None
+
+    def _listen(self):
+        """Takes what the world has said of who has which place."""
+        while (sample := self._members.receive()) is not None:
+            header = s.FrameHeader.from_buffer_copy(sample.user_header().contents)
+            records = _copied(sample, s.Member)
+            fault = self._not_the_world(header, sample)
+            if fault is not None:
+                self._refuse(header, sample, fault)
+                continue
+            for member in records:
+                known = self._coordinators.get(member.index, _NOBODY)
+                if member.role == s.ROLE_COORDINATOR and known[:2] != (member.process_id, member.generation):
+                    self._coordinators[member.index] = member.process_id, member.generation, None
+
+    def _fault(self, header, sample, role):
         """What is wrong with the header of a frame, if anything is."""
         for field, expected in (
             ("schema_hash", s.SCHEMA_HASH),
@@ -469,7 +517,7 @@ class Session:
         # There is no summary in which it could stand.
         for line in self.refused():
             print(line, file=sys.stderr)
-        self._state = self._states = self._coordination = self._commands = None
+        self._state = self._states = self._coordination = self._members = self._commands = None
         self._replies = self._requests = self._node = None
         try:
             # Whoever is in the run holds this lock too.

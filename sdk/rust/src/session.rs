@@ -11,8 +11,8 @@ use iceoryx2::prelude::AllocationStrategy;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::ipc;
 use ipc_schemas::{
-    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, Role,
-    VehicleCommand, VehicleState,
+    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault,
+    Member, Role, VehicleCommand, VehicleState,
 };
 use std::time::{Duration, Instant};
 
@@ -43,13 +43,15 @@ pub struct Session {
     pending: Option<Pending>,
     states: Inbox<VehicleState>,
     coordination: Inbox<Assignment>,
+    members: Inbox<Member>,
     commands: Publisher<ipc::Service, [VehicleCommand], FrameHeader>,
     line: attach::Line,
     _space: Space,
     run: Run,
     reply: AttachReply,
-    /// The sending end that has proved to be the world's.
-    world_origin: Option<u128>,
+    /// The sending ends that have proved to be the world's: of states, and of who has which place.
+    world_origins: [Option<u128>; 2],
+    coordinators: Vec<Seat>,
     /// The first step whose coordination is not in force yet.
     next_step: u64,
     /// When to ask again for what was missed, while that has not come.
@@ -57,6 +59,15 @@ pub struct Session {
     is_complete: bool,
     board: Board,
     refusals: Refusals,
+}
+
+/// A coordinator, as the world says.
+#[derive(Clone, Copy, Default)]
+struct Seat {
+    process_id: u32,
+    generation: u32,
+    /// The sending end that has proved to be that process's.
+    origin: Option<u128>,
 }
 
 /// A state to be answered.
@@ -90,6 +101,7 @@ impl Session {
         let node = space.node();
         let states = Inbox::open(node, frames::SERVICE_STATE)?;
         let coordination = Inbox::open(node, frames::SERVICE_COORDINATION)?;
+        let members = Inbox::open(node, frames::SERVICE_MEMBERS)?;
         let commands = node
             .service_builder(&name(frames::SERVICE_COMMAND)?)
             .publish_subscribe::<[VehicleCommand]>()
@@ -111,6 +123,7 @@ impl Session {
             pending: None,
             states,
             coordination,
+            members,
             commands,
             line,
             _space: space,
@@ -121,7 +134,8 @@ impl Session {
             refusals: Refusals::default(),
             run,
             reply,
-            world_origin: None,
+            world_origins: [None; 2],
+            coordinators: Vec::new(),
         })
     }
 
@@ -222,13 +236,44 @@ impl Session {
         let AttachReply { run_id, world_process_id: expected, .. } = self.reply;
         ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
             .check(header, records)?;
-        if self.world_origin != Some(origin) {
-            if self.states.process_of(origin).is_some_and(|process| process != expected) {
-                return Err(Refusal::Stranger { expected });
+        let [known, _] = &mut self.world_origins;
+        prove(known, origin, expected, || self.states.process_of(origin))
+    }
+
+    /// Takes what the world has said of who has which place. It says so before whoever takes a place can send.
+    fn listen(&mut self) -> Result<(), Error> {
+        for _ in 0..AT_ONCE {
+            let Some(frame) = self.members.receive()? else { break };
+            let header = *frame.user_header();
+            let told = frame.payload().to_vec();
+            let origin = frame.origin().value();
+            drop(frame);
+            if let Err(refusal) = self.judge_members(&header, origin, told.len()) {
+                let members = &self.members;
+                self.refusals.enter(&header, origin, refusal, || members.process_of(origin));
+                continue;
             }
-            self.world_origin = Some(origin);
+            for Member { process_id, generation, role, index } in told {
+                if role != frames::ROLE_COORDINATOR || index >= 64 {
+                    continue;
+                }
+                let index = usize::from(index);
+                self.coordinators.resize(self.coordinators.len().max(index + 1), Seat::default());
+                let seat = &mut self.coordinators[index];
+                if (seat.process_id, seat.generation) != (process_id, generation) {
+                    *seat = Seat { process_id, generation, origin: None };
+                }
+            }
         }
         Ok(())
+    }
+
+    fn judge_members(&mut self, header: &FrameHeader, origin: u128, records: usize) -> Result<(), Refusal> {
+        let AttachReply { run_id, world_process_id: expected, .. } = self.reply;
+        ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
+            .check(header, records)?;
+        let [_, known] = &mut self.world_origins;
+        prove(known, origin, expected, || self.members.process_of(origin))
     }
 
     /// Takes coordination of the step at hand, as far as it has come.
@@ -243,6 +288,10 @@ impl Session {
             let assignments = frame.payload().to_vec();
             let origin = frame.origin().value();
             drop(frame);
+            let index = usize::from(header.sender_index);
+            if self.coordinators.get(index).is_none_or(|seat| seat.origin != Some(origin)) {
+                self.listen()?;
+            }
             match self.judge_coordination(&header, origin, &assignments) {
                 Ok(true) => {
                     self.board.coordinate(&assignments);
@@ -262,17 +311,28 @@ impl Session {
 
     /// Whether a coordination frame is to be taken, and not merely late or of a step to come.
     fn judge_coordination(
-        &self,
+        &mut self,
         header: &FrameHeader,
-        _origin: u128,
+        origin: u128,
         assignments: &[Assignment],
     ) -> Result<bool, Refusal> {
         let AttachReply { run_id, coordinators, .. } = self.reply;
-        let FrameHeader { sender_index: index, generation, .. } = *header;
-        ExpectedHeader { run_id, role: Role::Coordinator, index, generation, step: header.step }
-            .check(header, assignments.len())?;
-        if u32::from(index) >= coordinators.min(64) {
-            return Err(Refusal::NoSuchCoordinator { coordinators });
+        let index = header.sender_index;
+        let seat = self.coordinators.get_mut(usize::from(index));
+        let generation = seat.as_ref().map_or(0, |seat| seat.generation);
+        match (ExpectedHeader { run_id, role: Role::Coordinator, index, generation, step: header.step })
+            .check(header, assignments.len())
+        {
+            // What a coordinator that has died left; its successor sends the same again.
+            Err(HeaderFault::OldGeneration { .. }) => return Ok(false),
+            checked => checked?,
+        }
+        let Some(seat) = seat else { return Err(Refusal::NoSuchCoordinator { coordinators }) };
+        if seat.origin != Some(origin) {
+            match self.coordination.process_of(origin) {
+                None => return Ok(false),
+                process => prove(&mut seat.origin, origin, seat.process_id, || process)?,
+            }
         }
         if let Some(record) = assignments.iter().position(|a| a.zone >= self.run.spec.zones) {
             return Err(Refusal::NoSuchZone { record, zone: assignments[record].zone });
@@ -394,6 +454,22 @@ impl Drop for Session {
         // There is no summary in which it could stand.
         self.refused().iter().for_each(|refused| eprintln!("{refused}"));
     }
+}
+
+/// Notes the sending end of the process expected, unless it is known to be that of another.
+fn prove(
+    known: &mut Option<u128>,
+    origin: u128,
+    expected: u32,
+    process: impl FnOnce() -> Option<u32>,
+) -> Result<(), Refusal> {
+    if *known != Some(origin) {
+        if process().is_some_and(|process| process != expected) {
+            return Err(Refusal::Stranger { expected });
+        }
+        *known = Some(origin);
+    }
+    Ok(())
 }
 
 /// Whether a process exists and is not merely waiting to be reaped.

@@ -1,0 +1,257 @@
+//! What the packages promise their users, in every language.
+
+use crate::common::{Ended, Site, hash};
+use crate::{compiled, cz, installed, python, root, rust};
+use control_zones::lockstep::in_process::InProcess;
+use control_zones::scenario::load;
+use ipc_schemas::STATE_LEFT;
+use serde_json::Value;
+use std::collections::HashMap;
+use std::path::Path;
+use std::process::Command;
+use std::sync::Arc;
+use std::time::Duration;
+
+/// The same controller in all languages there are: name and command line.
+fn in_every_language(folder: &Path) -> Vec<(&'static str, String)> {
+    let fixtures = root().join("tests/fixtures");
+    let mut all = vec![("Rust", rust("pauses")), ("C", compiled(&fixtures.join("pauses.c"), folder))];
+    all.extend(
+        python().map(|python| ("Python", format!("{python} {}", fixtures.join("pauses.py").display()))),
+    );
+    all
+}
+
+/// Runs zone 2 with that controller; the site's summary and what was said on stderr.
+fn driven(site: &Site, command: &str, arguments: &[&str]) -> (Value, Ended) {
+    let controller = format!("merge-2={command}");
+    let all = [&["--json", "-", "--controller", &controller], arguments].concat();
+    let ended = site.start("cz", &all).ended_within(Duration::from_secs(240));
+    (ended.json(), ended)
+}
+
+/// What the controller says at its end: steps answered, skipped, and wrong.
+fn counts(ended: &Ended) -> [u64; 3] {
+    let said = ended.err.lines().find_map(|line| line.split_once("merge-2] answered ")).map(|(_, said)| said);
+    let said = said.unwrap_or_else(|| panic!("{ended:?}"));
+    let numbers = said.split(|c: char| !c.is_ascii_digit()).filter_map(|n| n.parse().ok());
+    numbers.collect::<Vec<u64>>().try_into().unwrap()
+}
+
+#[test]
+fn a_controller_that_pauses_catches_up_in_every_language() {
+    let folder = tempfile::tempdir().unwrap();
+    for (language, command) in in_every_language(folder.path()) {
+        for policy in ["hold", "shield-fallback"] {
+            pauses_and_catches_up(language, &format!("CZ_PAUSES=0.1,1 exec {command}"), policy, &[]);
+        }
+    }
+}
+
+/// The same with a minute's pause: `cargo test --test plugins -- --ignored a_minute`.
+#[test]
+#[ignore = "takes several minutes"]
+fn a_controller_that_pauses_for_a_minute_catches_up_in_every_language() {
+    let folder = tempfile::tempdir().unwrap();
+    for (language, command) in in_every_language(folder.path()) {
+        let command = format!("CZ_PAUSES=60 exec {command}");
+        pauses_and_catches_up(language, &command, "hold", &["--peer-timeout", "100"]);
+    }
+}
+
+fn pauses_and_catches_up(language: &str, command: &str, policy: &str, arguments: &[&str]) {
+    let site = Site::new("pause");
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("run.czlog");
+    let record = file.to_str().unwrap();
+    let conduct = ["--deadline", "0.02", "--on-miss", policy, "--shield", "on", "--record", record];
+    let (summary, ended) = driven(&site, command, &[&conduct[..], arguments].concat());
+    let [answered, skipped, wrong] = counts(&ended);
+    let steps = summary["steps"].as_u64().unwrap();
+    let missed = summary["punctuality"]["missed_steps"].as_u64().unwrap();
+    println!(
+        "{language}, {policy}: {answered} of {steps} steps answered, {skipped} skipped, {missed} missed"
+    );
+    // The pauses are longer than a deadline, and the controller is heard again after each.
+    assert!(skipped > 0 && missed > skipped, "{language}, {policy}: {ended:?}");
+    assert!(answered > 2 * 300, "{language}, {policy}: {ended:?}");
+    assert!(steps - answered <= missed, "{language}, {policy}: {ended:?}");
+    assert_eq!(wrong, 0, "{language}, {policy}: it was shown what does not fit together");
+    let replay = cz().args(["replay", record, "--json"]).output().unwrap();
+    assert!(replay.status.success(), "{language}, {policy}: {replay:?}");
+    site.assert_clean();
+}
+
+#[test]
+fn python_ocbf_drives_as_the_built_in_law() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let trace = folder.path().join("trace.csv");
+    cz().args(["run", "--controller", &format!("merge-2={python} examples/python/ocbf.py")])
+        .env("CZ_TRACE", &trace)
+        .assert()
+        .success();
+    let mut seen: HashMap<(u64, u32), (f64, f64)> = HashMap::new();
+    for line in std::fs::read_to_string(&trace).unwrap().lines() {
+        let cells: Vec<&str> = line.split(',').collect();
+        let number = |i: usize| cells[i].parse::<f64>().unwrap();
+        seen.insert((number(0) as u64, number(1) as u32), (number(2), number(3)));
+    }
+    let mut run = InProcess::new(&Arc::new(load(None, &[], None).unwrap()), 1, 1);
+    let (mut compared, mut worst) = (0, 0.0_f64);
+    loop {
+        let step = run.world().step();
+        for s in run.world().records().filter(|s| s.zone == 1 && s.flags & STATE_LEFT == 0) {
+            // The last state frame ends the run and is not answered, so it is not in the trace.
+            let Some((x, v)) = seen.get(&(step, s.vehicle)) else {
+                panic!("step {step}: vehicle {} is not in zone 2 of the other run", s.vehicle);
+            };
+            worst = worst.max((x - s.x_m).abs()).max((v - s.v_mps).abs());
+            compared += 1;
+        }
+        if !run.step().unwrap() {
+            break;
+        }
+    }
+    println!("{compared} vehicle-steps, greatest difference {worst:.2e}");
+    assert_eq!(compared, seen.len());
+    assert!(worst < 1e-6, "{worst}");
+}
+
+#[test]
+fn unknown_targets_and_broken_programs_are_reported() {
+    let fails = |target: &str, code: i32, words: &str| {
+        let output = cz().args(["run", "--controller", target]).assert().code(code).get_output().clone();
+        let text = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(text.contains(words), "{target}: {text}");
+    };
+    fails("merge-3=true", 2, "did you mean merge-");
+    fails("merge-2", 2, "expected TARGET=COMMAND");
+    fails("merge-2=echo no such luck >&2; exit 7", 1, "ended with code 7: no such luck");
+    cz().args(["run", "--in-process", "--controller", "merge-2=true"]).assert().code(2);
+}
+
+#[test]
+fn sdk_install_installs_all_it_says_and_otherwise_says_what_to_build() {
+    let prefix = installed();
+    let output = cz().args(["sdk", "install", "--prefix"]).arg(prefix).output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(said.lines().count(), 7, "{said}");
+    for file in said.lines() {
+        assert!(std::fs::metadata(file).unwrap().len() > 0, "{file} is empty");
+    }
+    // Beside a program that was copied elsewhere there is no library.
+    let elsewhere = tempfile::tempdir().unwrap();
+    let program = elsewhere.path().join("cz");
+    std::fs::copy(env!("CARGO_BIN_EXE_cz"), &program).unwrap();
+    let mut command = Command::new(&program);
+    let output =
+        command.args(["sdk", "install", "--prefix"]).arg(elsewhere.path().join("to")).output().unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("libcontrol_zones_c.so: "), "{said}");
+    assert!(said.contains("cargo build --release -p control-zones-c"), "{said}");
+}
+
+#[test]
+fn golden_vectors_are_those_checked_in() {
+    let output = cz().args(["plugin", "golden"]).assert().success().get_output().stdout.clone();
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/docs/golden-vectors.json");
+    let checked_in = std::fs::read(path).unwrap();
+    assert!(output == checked_in, "docs/golden-vectors.json is stale: `cz plugin golden > {path}`");
+}
+
+/// The program a document prints: the lines from one that contains `first` on, as far as they begin with
+/// `margin`, without it. A line of the margin's own without its last blanks is an empty one.
+fn printed(file: &str, margin: &str, first: &str) -> String {
+    let text = std::fs::read_to_string(root().join(file)).unwrap();
+    let lines = text.lines().skip_while(|line| !(line.starts_with(margin) && line.contains(first)));
+    let inside = lines.map_while(|line| match line.strip_prefix(margin) {
+        Some(code) => Some(code),
+        None => margin.starts_with(line).then_some(""),
+    });
+    let code: String =
+        inside.take_while(|line| !["PY", "```"].contains(line)).map(|l| format!("{l}\n")).collect();
+    assert!(code.lines().count() > 4, "{file} prints no program with {first:?} in its first line: {code}");
+    code
+}
+
+#[test]
+fn documented_controllers_run_as_printed_within_limits_and_without_a_shield() {
+    let folder = tempfile::tempdir().unwrap();
+    let written = |name: &str, code: String| {
+        let path = folder.path().join(name);
+        std::fs::write(&path, code).unwrap();
+        path
+    };
+    // The documentation of the Rust package prints this example.
+    let mut all = vec![("sdk/rust/src/lib.rs", rust("cruise"))];
+    for (name, file, margin) in [
+        ("printed_c.c", "sdk/c/include/control_zones/plugin.h", " *     "),
+        ("printed_cpp.cpp", "sdk/c/include/control_zones/plugin.hpp", "//     "),
+    ] {
+        all.push((file, compiled(&written(name, printed(file, margin, "#include")), folder.path())));
+    }
+    if let Some(python) = python() {
+        for (name, file, margin) in [
+            ("docstring.py", "sdk/python/control_zones/__init__.py", "    "),
+            ("contract.py", "docs/plugin-contract.md", "    "),
+            ("readme.py", "README.md", ""),
+        ] {
+            let path = written(name, printed(file, margin, "import control_zones"));
+            all.push((file, format!("{python} {}", path.display())));
+        }
+        let example = root().join("examples/python/cruise.py");
+        all.push(("examples/python/cruise.py", format!("{python} {}", example.display())));
+    }
+    let mut hashes = Vec::new();
+    for (file, command) in all {
+        let site = Site::new("printed");
+        let (summary, _) = driven(&site, &command, &["--shield", "off"]);
+        hashes.push((file, hash(&summary)));
+        site.assert_clean();
+    }
+    // All of them hold 15 m/s.
+    assert!(hashes.iter().all(|(_, hash)| *hash == hashes[0].1), "{hashes:?}");
+}
+
+#[test]
+fn python_arrays_are_read_only_may_be_kept_and_mistakes_are_explained() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let run = |law: &str| {
+        let path = folder.path().join("law.py");
+        let code = format!("import control_zones\nkept = []\n{law}\ncontrol_zones.run(law)\n");
+        std::fs::write(&path, code).unwrap();
+        let site = Site::new("arrays");
+        let controller = format!("merge-2={python} {}", path.display());
+        let ended = site
+            .start("cz", &["--controller", &controller, "--set", "end.time_s=60", "--shield", "on"])
+            .ended();
+        site.assert_clean();
+        ended
+    };
+    // Each of these ended the controller with a signal, or changed what it saw, or the next would have seen.
+    for (law, step) in [
+        ("def law(zone):\n    err = zone.v\n    err -= 15\n    return -err", "zone merge-2"),
+        ("def law(zone):\n    zone.ahead_x[:] = 0\n    return zone.u * 0", "zone merge-2"),
+        ("def law(zone):\n    gap = zone.ahead_x\n    gap -= zone.x\n    return zone.u * 0", "zone merge-2"),
+        ("def law(zone):\n    zone.states['v_mps'] = 3\n    return zone.u * 0", "zone merge-2"),
+        ("def law(zone):\n    zone.terminal[:] = 3\n    return zone.u * 0", "zone merge-2"),
+    ] {
+        let words = "the arrays of a zone are read-only; make one of your own, such as `err = zone.v - 15`";
+        run(law).expect(1, &[words, step]);
+    }
+    let keeps = "def law(zone):\n    kept.append((zone, zone.v, zone.states, zone.commands, zone.v.sum()))\n    \
+                 assert all(v.sum() == total and states['v_mps'].size for _, v, states, _, total in kept[-50:])\n    \
+                 return (15.0 - zone.v).clip(-4, 4)";
+    run(keeps).expect(0, &[]);
+    for (law, words) in [
+        ("def law(zone):\n    return None", "returned None; expected 1 accelerations, one per vehicle"),
+        ("def law(zone):\n    return 1.0", "returned a float; expected 1 accelerations, one per vehicle"),
+        ("def law(zone):\n    return [0.0] * 9", "returned 9 accelerations; expected 1 accelerations"),
+    ] {
+        run(law).expect(1, &[words]);
+    }
+}
