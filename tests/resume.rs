@@ -116,6 +116,12 @@ fn steps_in(file: &Path) -> u64 {
     Reader::open(file).map_or(0, |reader| reader.steps().map_while(Result::ok).count() as u64)
 }
 
+/// Those of them in which somebody missed the deadline.
+fn missed_in(file: &Path) -> usize {
+    let missed = |reader: Reader<_>| reader.steps().map_while(Result::ok).filter(|s| s.misses != 0).count();
+    Reader::open(file).map_or(0, missed)
+}
+
 #[test]
 fn a_resumed_run_is_recorded_with_its_past_and_can_be_resumed_again() {
     let (site, directory) = (Site::new("rr"), tempfile::tempdir().unwrap());
@@ -171,12 +177,15 @@ fn a_run_cut_off_behind_a_missed_step_goes_on_as_if_it_had_not_been() {
     let (site, directory) = (Site::new("mc"), tempfile::tempdir().unwrap());
     let (file, cut, out) =
         (file(&directory), directory.path().join("cut.czlog"), directory.path().join("out.czlog"));
-    let (supervisor, parts) = begin(&site, &[&PACED[..], &["--on-miss", "hold"]].concat(), &file, 3);
-    std::thread::sleep(Duration::from_millis(2500));
+    // Nobody waits for its end.
+    let arguments = [&paced("end.time_s=300")[..], &["--on-miss", "hold", "--record-lag", "wait"]].concat();
+    let (supervisor, parts) = begin(&site, &arguments, &file, 3);
+    wait_until("vehicles to be on the road", || steps_in(&file) > 250);
     send(part(&parts, "ctrl"), Signal::STOP);
-    std::thread::sleep(Duration::from_millis(500));
+    wait_until("a missed step to be recorded", || missed_in(&file) > 0);
     send(part(&parts, "ctrl"), Signal::CONT);
-    supervisor.ended().json();
+    supervisor.signal(Signal::INT);
+    supervisor.ended().expect(130, &["cz resume"]);
     let reader = Reader::open(&file).unwrap();
     let mut writer = Writer::new(std::fs::File::create(&cut).unwrap(), reader.metadata()).unwrap();
     let mut steps = reader.steps().map(Result::unwrap);
@@ -253,31 +262,36 @@ fn a_branch_shares_the_past_and_not_the_future() {
 }
 
 /// A paced run with traffic from the start.
-const PACED: [&str; 11] = [
-    "varying-demand",
-    "--set",
-    "end.time_s=4",
-    "--set",
-    "dt_s=0.01",
-    "--set",
-    "roads.main1.demand.rates=[{until_s=100.0,vehicles_per_hour=1700.0}]",
-    "--pace",
-    "realtime",
-    "--json",
-    "-",
-];
+fn paced(end: &str) -> [&str; 11] {
+    let demand = "roads.main1.demand.rates=[{until_s=300.0,vehicles_per_hour=1700.0}]";
+    let set = ["--set", end, "--set", "dt_s=0.01", "--set", demand];
+    let [a, b, c, d, e, f] = set;
+    ["varying-demand", a, b, c, d, e, f, "--pace", "realtime", "--json", "-"]
+}
 
 #[test]
 fn a_stopped_controller_is_dealt_with_as_the_policy_says_and_replayed_alike() {
     for policy in ["wait", "hold", "shield-fallback", "abort"] {
         let (site, directory) = (Site::new("miss"), tempfile::tempdir().unwrap());
         let file = file(&directory);
-        let (supervisor, parts) = begin(&site, &[&PACED[..], &["--on-miss", policy]].concat(), &file, 3);
+        // A machine with much else to do must not end the run before anybody is stopped.
+        let deadline = if policy == "abort" { "2" } else { "0.01" };
+        let conduct = ["--on-miss", policy, "--deadline", deadline, "--record-lag", "wait"];
+        let arguments = [&paced("end.time_s=8")[..], &conduct].concat();
+        let (supervisor, parts) = begin(&site, &arguments, &file, 3);
         let controller = part(&parts, "ctrl");
-        std::thread::sleep(Duration::from_millis(2500));
+        wait_until("vehicles to be on the road", || steps_in(&file) > 250);
         send(controller, Signal::STOP);
-        std::thread::sleep(Duration::from_millis(500));
-        send(controller, Signal::CONT);
+        match policy {
+            // Its step is late once a deadline has passed, and is waited for all the same.
+            "wait" => std::thread::sleep(Duration::from_millis(500)),
+            // It is ended, stopped as it is.
+            "abort" => {}
+            _ => wait_until("ten missed steps to be recorded", || missed_in(&file) >= 10),
+        }
+        if policy != "abort" {
+            send(controller, Signal::CONT);
+        }
         let ended = supervisor.ended();
         if policy == "abort" {
             ended.expect(1, &["the deadline of step", "controller 0"]);
@@ -301,9 +315,11 @@ fn a_stopped_controller_is_dealt_with_as_the_policy_says_and_replayed_alike() {
 #[test]
 fn a_paced_run_has_the_hash_of_a_free_one() {
     let site = Site::new("pace");
-    let free: Vec<&str> = PACED.iter().copied().filter(|a| !["--pace", "realtime"].contains(a)).collect();
+    let free: Vec<&str> =
+        paced("end.time_s=4").into_iter().filter(|a| !["--pace", "realtime"].contains(a)).collect();
     let expected = common::hash(&site.start("cz", &free).ended().json());
-    let summary = site.start("cz", &[&PACED[..], &["--deadline", "10"]].concat()).ended().json();
+    let summary =
+        site.start("cz", &[&paced("end.time_s=4")[..], &["--deadline", "10"]].concat()).ended().json();
     assert_eq!(common::hash(&summary), expected);
     assert_eq!(summary["punctuality"]["lateness_ns"]["count"], 401);
     assert!(summary["wall_s"].as_f64().unwrap() >= 4.0, "{summary}");
