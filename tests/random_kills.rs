@@ -59,11 +59,7 @@ impl Disturbance {
                 .for_each(|instant| *instant = Duration::from_millis(random.random_range(0..150)));
         }
         instants.sort();
-        // Without a recording nothing can be resumed; so world and supervisor die where there is one.
-        let victims: &[&str] = match is_recorded {
-            true => &["coord", "ctrl", "coord", "ctrl", "coord", "ctrl", "world", "cz"],
-            false => &["coord", "ctrl"],
-        };
+        let victims = ["coord", "ctrl", "coord", "ctrl", "coord", "ctrl", "world", "cz"];
         let mut last = Duration::ZERO;
         let kills = instants.into_iter().map(|instant| {
             let pause = instant - std::mem::replace(&mut last, instant);
@@ -137,7 +133,7 @@ fn check(seed: u64, length: &[Duration], expected: &HashMap<usize, String>) -> R
             command.args(["resume", &recording, "--run", site.run(), "--json", "-"]);
             command.output().unwrap()
         } else {
-            // Nothing to be resumed: from the beginning.
+            // Nothing to be resumed, for it was not recorded or had not begun: from the beginning.
             let (scenario, settings, _) = SCENARIOS[disturbance.scenario];
             let mut command = site.command("cz");
             command.args(["run", scenario, "--run", site.run(), "--json", "-"]).args(settings);
