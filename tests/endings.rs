@@ -7,6 +7,7 @@ mod common;
 use common::{ENDLESS, Process, Site, children, example, is_alive, send, wait_until};
 use rustix::process::Signal;
 use std::process::Stdio;
+use std::time::Duration;
 
 /// A run of 300 steps with a controller of another's, which is started so.
 fn arguments(command: &str) -> Vec<String> {
@@ -179,5 +180,20 @@ fn a_closed_terminal_ends_a_run_in_order() {
     });
     let output = run.wait_with_output().unwrap();
     assert!(output.status.success(), "{output:?}");
+    site.assert_clean();
+}
+
+#[test]
+fn a_run_waits_for_those_a_killed_supervisor_of_its_name_has_left() {
+    let site = Site::new("heir");
+    let (supervisor, parts) = common::begin(&site, &ENDLESS, 3);
+    let world = common::part(&parts, "world");
+    // One that is slow to leave, as on a busy machine.
+    common::hold(world);
+    supervisor.signal(Signal::KILL);
+    let heir = site.start("cz", &["--set", "end.time_s=10", "--json", "-"]);
+    std::thread::sleep(Duration::from_secs(2));
+    send(world, Signal::CONT);
+    heir.ended().json();
     site.assert_clean();
 }

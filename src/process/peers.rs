@@ -1,6 +1,7 @@
 //! Whether the other processes of a run are still alive.
 
 use crate::scenario::ControllerNames;
+use crate::transport::iox::RunName;
 use ipc_schemas::Role;
 
 /// Another process of the run.
@@ -79,6 +80,18 @@ pub fn children_of(process_id: u32) -> Vec<u32> {
     ids.filter_map(|entry| entry.file_name().to_str()?.parse().ok())
         .filter(|id| stat(*id).is_some_and(|fields| fields.split_whitespace().nth(1) == Some(&parent)))
         .collect()
+}
+
+/// Whether a part of a run is there whose supervisor has died: it is on its way out.
+pub fn is_orphaned(run: &RunName) -> bool {
+    let run = run.to_string();
+    let ids = std::fs::read_dir("/proc").into_iter().flatten().flatten();
+    ids.filter_map(|entry| entry.file_name().to_str()?.parse().ok()).any(|id: u32| {
+        let line = std::fs::read_to_string(format!("/proc/{id}/cmdline")).unwrap_or_default();
+        let value = |option| line.split('\0').skip_while(|word| *word != option).nth(1);
+        let supervisor = value("--supervised").and_then(|id| id.parse().ok());
+        value("--run") == Some(&run) && supervisor.is_some_and(|supervisor| !is_alive(supervisor))
+    })
 }
 
 #[cfg(test)]

@@ -14,7 +14,9 @@ use super::say::Crier;
 use super::{AppError, record};
 use crate::lockstep::RefusedFrames;
 use crate::own_time::OwnTime;
-use crate::process::{Observation, Outcome, ProcessError, Settled, children_of, is_stopped, signals_to_heed};
+use crate::process::{
+    Observation, Outcome, ProcessError, Settled, children_of, is_orphaned, is_stopped, signals_to_heed,
+};
 use crate::record::Reader;
 use crate::scenario::Plugin;
 use crate::transport::iox::{RunName, RunSpace, clean};
@@ -49,6 +51,8 @@ pub(super) struct Plan<'a> {
 const WAITING: usize = 1024;
 /// The clock is looked at this often.
 const LOOK: Duration = Duration::from_secs(1);
+/// Whoever has lost its supervisor leaves at once, but a busy machine may take its time over it.
+const LEAVING: Duration = Duration::from_secs(15);
 /// Of what a process has said last, this much is in a message, characters.
 const LAST_WORDS: usize = 500;
 
@@ -119,10 +123,11 @@ fn point_to(recording: Option<PathBuf>, error: AppError) -> AppError {
 /// Removes what a killed supervisor of the same run may have left, and refuses a run that is active: the
 /// parts started here would take the places of its own.
 fn claim(run: &RunName) -> Result<(), AppError> {
-    // The children of a supervisor killed just now are still on their way out.
-    let deadline = Instant::now() + GRACE / 2;
+    let start = Instant::now();
     while !RunSpace::sweep(run).map_err(ProcessError::from)? {
-        if Instant::now() >= deadline {
+        // The children of a supervisor killed just now are still on their way out.
+        let waited = start.elapsed();
+        if waited >= LEAVING || waited >= GRACE / 2 && !is_orphaned(run) {
             return Err(ProcessError::AlreadyActive { run: run.to_string() }.into());
         }
         std::thread::sleep(Duration::from_millis(10));
