@@ -6,7 +6,7 @@ mod common;
 
 use common::{Process, Site, children, files, is_alive, send, wait_until};
 use rustix::process::Signal;
-use std::os::unix::fs::PermissionsExt;
+use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
@@ -286,5 +286,22 @@ fn what_a_killed_run_left_is_swept_when_the_next_one_begins() {
     let other = common::unique_name("other");
     let ended = site.start_in("cz", &other, &["--set", "end.time_s=5"]).ended();
     ended.expect(0, &[]);
+    site.assert_clean();
+}
+
+#[test]
+fn a_run_waits_for_others_that_come_or_go() {
+    let site = Site::new("queue");
+    // As on a machine on which that takes them long.
+    std::fs::DirBuilder::new().mode(0o700).create(site.runs()).unwrap();
+    let mut held = std::process::Command::new("flock");
+    let mut held = held.arg(site.runs()).args(["sleep", "7"]).spawn().unwrap();
+    let runs = site.runs();
+    wait_until("the lock to be taken", || {
+        !std::process::Command::new("flock").arg("-n").arg(&runs).arg("true").status().unwrap().success()
+    });
+    let run = site.start("cz", &["--set", "end.time_s=10", "--json", "-"]);
+    held.wait().unwrap();
+    run.ended().json();
     site.assert_clean();
 }
