@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::{Ended, Process, Site, children, is_alive};
+use common::{Ended, LONG_RUN, Process, Site, children, is_alive};
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -19,10 +19,10 @@ const MANY: u64 = 1000;
 /// Longer than a run takes on a machine with much else to do.
 const VERY_LONG: Duration = Duration::from_secs(600);
 
-/// Scenarios, and the most processes per role each can use.
+/// Scenarios, and the most processes per role each can use. The long one is mostly middle, the others mostly start-up.
 const SCENARIOS: [(&str, &[&str], u32); 4] = [
     ("two-merges", &[], 2),
-    ("varying-demand", &["--set", "end.time_s=2000"], 2),
+    (LONG_RUN[0], LONG_RUN.split_at(1).1, 2),
     ("tree", &["--set", "end.time_s=400"], 3),
     ("corridor-8", &["--set", "end.time_s=300"], 4),
 ];

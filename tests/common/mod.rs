@@ -339,8 +339,10 @@ fn stat(process_id: u32) -> Option<Vec<String>> {
     (fields[0] != "Z" && fields[0] != "X").then_some(fields)
 }
 
+/// Whether a process is there, with all it has open: the first of its threads may be a zombie before the others are.
 pub fn is_alive(process_id: u32) -> bool {
-    stat(process_id).is_some()
+    let threads = || std::fs::read_dir(format!("/proc/{process_id}/task")).map_or(0, Iterator::count);
+    stat(process_id).is_some() || threads() > 1
 }
 
 /// Processor time a process has used, in ticks of 10 ms.
