@@ -158,6 +158,14 @@ fn least_speed(r: &Reference) -> f64 {
 proptest! {
     #![proptest_config(cases(2000))]
 
+    /// Wherever the search begins.
+    #[test]
+    fn near_a_guess_is_what_is_found_afresh(p in problems(), stretch in prop_oneof![0.5..2.0f64, Just(0.0), -1.0..0.0f64]) {
+        let fresh = p.solve_forward(ReferenceLaw::Corrected);
+        let near = p.solve_near(stretch * fresh.duration_s);
+        prop_assert!((near.duration_s - fresh.duration_s).abs() <= 1e-8 * fresh.duration_s, "{near:?} {fresh:?}");
+    }
+
     #[test]
     fn corrected_plan_has_the_least_cost_over_all_durations(p in problems()) {
         assert_least_cost(&p)?;

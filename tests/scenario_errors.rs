@@ -601,6 +601,15 @@ const SET_CASES: &[(&str, &str)] = &[
         "--set dt_s=0.1s: dt_s = \"0.1s\": expected a step from 1e-4 to 10 s, a whole number of nanoseconds",
     ),
     (
+        "gate.entry=closed",
+        "--set gate.entry=closed: gate.entry = \"closed\": expected \"free\" or \"viable\" or \"room_to_stop\"",
+    ),
+    ("control.law=best", "--set control.law=best: control.law = \"best\": expected \"ocbf\" or \"viable\""),
+    (
+        "control.viable.buffer_m=-1",
+        "--set control.viable.buffer_m=-1: control.viable.buffer_m = -1: expected a gap from 0 to 1000 m",
+    ),
+    (
         "dt=0.1",
         "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, gate, coordination, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
     ),

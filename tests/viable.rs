@@ -438,3 +438,23 @@ fn it_never_locks_up() {
         }
     }
 }
+
+/// However the roles are shared out.
+#[test]
+fn one_hash_for_any_number_of_processes() {
+    for name in ["two-merges", "intersection", "roundabout", "grid-3x3"] {
+        let mut scenario = scenario(name, &["control.law=viable", "gate.entry=viable"], 1);
+        scenario.max_vehicles = Some(60);
+        let scenario = Arc::new(scenario);
+        let zones = scenario.network.zones.len() as u32;
+        let hash = |coordinators: u32, controllers: u32| {
+            let mut run = InProcess::new(&scenario, coordinators.min(zones), controllers.min(zones));
+            run.run().unwrap();
+            run.world().summary().state_hash
+        };
+        let expected = hash(1, 1);
+        for (coordinators, controllers) in [(2, 1), (1, 2), (3, 3)] {
+            assert_eq!(hash(coordinators, controllers), expected, "{name}");
+        }
+    }
+}

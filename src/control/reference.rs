@@ -75,6 +75,25 @@ impl Problem {
         }
     }
 
+    /// The optimum a vehicle can drive, near a duration at which it is likely to be: where the cost has one minimum, Newton
+    /// finds it from there.
+    pub fn solve_near(&self, guess_s: f64) -> Optimum {
+        let quartic = self.quartic();
+        let is_monotone = quartic.is_monotone();
+        let mut duration = guess_s;
+        for _ in 0..8 {
+            if !(is_monotone && duration > 0.0 && duration.is_finite()) {
+                break;
+            }
+            let residual = quartic.value(duration);
+            if residual.abs() <= 1e-12 * quartic.s {
+                return self.coefficients(duration);
+            }
+            duration -= residual / quartic.slope(duration);
+        }
+        self.solve_forward(ReferenceLaw::Corrected)
+    }
+
     /// Re-plans for another terminal speed by perturbing the duration of `old` (paper:
     /// `equ:delta_t`).
     ///

@@ -28,11 +28,20 @@ pub struct Spacing {
     pub buffer_s: f64,
 }
 
+impl Passage {
+    /// Whether a vehicle that passes with a speed after a time does so in the spacing.
+    #[inline]
+    pub fn is_kept_by(&self, v_mps: f64, time_s: f64, spacing: &Spacing) -> bool {
+        self.lead_m + self.speed_mps * time_s >= spacing.kept_m(v_mps, time_s)
+    }
+}
+
 impl Spacing {
     /// What it is for a vehicle that passes with a speed after a time, m.
     #[inline]
     pub fn kept_m(&self, v_mps: f64, time_s: f64) -> f64 {
-        self.reaction_s * v_mps + self.gap_m + self.buffer_m * (time_s / self.buffer_s).min(1.0)
+        let share = if time_s < self.buffer_s { time_s / self.buffer_s } else { 1.0 };
+        self.reaction_s * v_mps + self.gap_m + self.buffer_m * share
     }
 }
 
@@ -93,7 +102,8 @@ pub fn free_duration_s(beta: f64, v_mps: f64, distance_m: f64, guess_s: f64) -> 
         let slope = 1.5 * y * (2.0 * p * q + l * y * (q + 3.0 * p));
         // At rest the slope vanishes with y; there is a root beyond.
         let next = if slope > 0.0 { y - excess / slope } else { 1.0 };
-        let is_found = (next - y).abs() <= 1e-12 * next;
+        // Each step squares what is missing.
+        let is_found = (next - y).abs() <= 1e-7 * next;
         y = next;
         if is_found {
             break;

@@ -10,7 +10,7 @@ use super::reference::{Problem, Terminal};
 use super::rows::{Interval, Row, Rows};
 use super::slot::{self, Exit, Passage, Spacing};
 use crate::conflict::DutyKind;
-use crate::scenario::{ReferenceLaw, Scenario, VehicleParams, ViableParams};
+use crate::scenario::{Scenario, VehicleParams, ViableParams};
 use crate::shield::{self, Ends, Seen, Shield};
 use crate::vehicle::{Held, Inequality, Pair, RearEnd};
 use ipc_schemas::{MODE_FREE, MODE_SCHEDULED, MODE_SLOT};
@@ -154,6 +154,10 @@ impl Viable {
                 buffer_s: self.params.buffer_s,
             };
             let passage = passage(s, &partner, at_m);
+            let ends_there = (s.length_m - at_m).abs() < LEAST_PLAN_M;
+            if ends_there && passage.is_kept_by(base.exit_mps, base.exit_s, &spacing) {
+                continue;
+            }
             let time_s = slot::duration_s(distance_m, s.v_mps, &passage, &spacing);
             if time_s <= base.passes_s(s, distance_m) {
                 continue;
@@ -196,7 +200,11 @@ impl Viable {
         };
         let problem =
             Problem { beta: self.beta, v0_mps: s.v_mps, length_m: distance_m, terminal: s.terminal };
-        let optimum = problem.solve_forward(ReferenceLaw::Corrected);
+        let guess_s = memory.words[FREE_EXIT] - s.time_s;
+        let optimum = problem.solve_near(guess_s);
+        if (optimum.duration_s - guess_s).abs() > STALE_S {
+            memory.words[FREE_EXIT] = s.time_s + optimum.duration_s;
+        }
         Plan { aim: Aim::Free, u_mps2: optimum.b, exit_s: optimum.duration_s, exit_mps: w }
     }
 
@@ -315,31 +323,36 @@ impl Viable {
         };
         // No more braking is asked for comfort, or for v_max, than the vehicle can do.
         let mut wish = wish_mps2.max(u_min_mps2).min(vehicle.u_max_mps2);
-        let fastest_mps2 = (vehicle.v_max_mps - s.v_mps) / self.dt_s;
-        wish = at_most(rows, wish, fastest_mps2.max(u_min_mps2), Row::VMax);
+        if s.v_mps + wish * self.dt_s > vehicle.v_max_mps {
+            let fastest_mps2 = (vehicle.v_max_mps - s.v_mps) / self.dt_s;
+            wish = at_most(rows, wish, fastest_mps2.max(u_min_mps2), Row::VMax);
+        }
         if params.comfort {
             for partner in partners.clone().filter(|partner| partner.kind == DutyKind::RearEnd) {
                 let row = self.comfort_row(s, &partner);
-                wish = at_most(rows, wish, (row.bound / row.coefficient).max(u_min_mps2), Row::Comfort);
+                if row.coefficient * wish > row.bound {
+                    wish = at_most(rows, wish, (row.bound / row.coefficient).max(u_min_mps2), Row::Comfort);
+                }
             }
         }
         // Whoever has to brake outranks the least speed.
-        rows.at_least(((vehicle.v_min_mps - s.v_mps) / self.dt_s).min(wish), Row::VMin);
+        if s.v_mps + wish * self.dt_s < vehicle.v_min_mps {
+            rows.at_least(((vehicle.v_min_mps - s.v_mps) / self.dt_s).min(wish), Row::VMin);
+        }
         let mut ends = viability.ends(s.x_m, s.v_mps, wish);
         for partner in partners {
             let seen = self.seen(&partner, partner.gap_m);
             let plain = |tier: &Shield, ends: &Ends, gap_m: f64| {
                 tier.plainly_admits(ends, partner.kind, partner.conflict_m, &Seen { gap_m, ..seen })
             };
-            let owed = self.owed(&partner, &seen);
-            if params.viability
-                && !plain(viability, &ends, seen.gap_m)
-                && viability.is_viable(s.x_m, s.v_mps, &owed)
-            {
-                let high_mps2 = viability.project(s.x_m, s.v_mps, wish, std::iter::once(owed)).u_mps2;
-                if high_mps2 < wish {
-                    wish = at_most(rows, wish, high_mps2, row_of(partner.kind));
-                    ends = viability.ends(s.x_m, s.v_mps, wish);
+            if params.viability && !plain(viability, &ends, seen.gap_m) {
+                let owed = self.owed(&partner, &seen);
+                if viability.is_viable(s.x_m, s.v_mps, &owed) {
+                    let high_mps2 = viability.project(s.x_m, s.v_mps, wish, std::iter::once(owed)).u_mps2;
+                    if high_mps2 < wish {
+                        wish = at_most(rows, wish, high_mps2, row_of(partner.kind));
+                        ends = viability.ends(s.x_m, s.v_mps, wish);
+                    }
                 }
             }
             if params.bodies {
@@ -350,7 +363,7 @@ impl Viable {
                 if plain(bodies, &ends, body_m + clearance_m) {
                     continue;
                 }
-                let owed = shield::Partner { gap_m: body_m + clearance_m, ..owed };
+                let owed = self.owed(&partner, &Seen { gap_m: body_m + clearance_m, ..seen });
                 let high_mps2 = bodies.project(s.x_m, s.v_mps, wish, std::iter::once(owed)).u_mps2;
                 if high_mps2 < wish {
                     wish = at_most(rows, wish, high_mps2, Row::Bodies);

@@ -81,8 +81,6 @@ pub struct Ends {
     v0_mps: f64,
     x1_m: f64,
     v1_mps: f64,
-    /// Where full braking would stop it afterwards, m.
-    stops_m: f64,
     /// What a margin may be less within the step than at its ends, m.
     dip_m: f64,
 }
@@ -227,19 +225,18 @@ impl Shield {
         // A vehicle that stops within the step gets no further than with the speed it began with.
         let mean_mps = if end_mps > 0.0 { v_mps + 0.5 * u_mps2 * dt } else { v_mps };
         let (x1_m, v1_mps) = (x_m + mean_mps * dt, end_mps.max(0.0));
-        let stops_m = x1_m + v1_mps * v1_mps / (2.0 * b);
-        Ends { x0_m: x_m, v0_mps: v_mps, x1_m, v1_mps, stops_m, dip_m: 0.125 * (u_mps2.abs() + b) * dt * dt }
+        Ends { x0_m: x_m, v0_mps: v_mps, x1_m, v1_mps, dip_m: 0.125 * (u_mps2.abs() + b) * dt * dt }
     }
 
     /// Whether a step is admissible toward a partner at `(x_m, v_mps)` that brakes fully, by a wide berth: what most steps keep,
     /// and takes no root and no division to see. Who does not keep it may still be admissible.
     #[inline]
     pub fn plainly_admits(&self, own: &Ends, kind: DutyKind, at_m: f64, other: &Seen) -> bool {
-        if kind != DutyKind::RearEnd && own.x1_m < at_m {
-            // It can stop before the point.
-            return own.stops_m + 2.0 * RESERVE_M <= at_m;
-        }
         let (b, dt) = (self.braking_mps2, self.dt_s);
+        if kind != DutyKind::RearEnd && own.x1_m < at_m {
+            // It can stop before the point; times 2 B, so that nothing is divided.
+            return 2.0 * b * (at_m - own.x1_m - 2.0 * RESERVE_M) >= own.v1_mps * own.v1_mps;
+        }
         if kind == DutyKind::Cross || own.x0_m < at_m && kind == DutyKind::Merge || other.braking_mps2 != b {
             return false;
         }
@@ -249,7 +246,7 @@ impl Shield {
         let after_m = y1_m - own.x1_m - self.reaction_s * own.v1_mps - other.gap_m;
         let shed = (own.v1_mps - self.reaction_s * b).max(0.0);
         let berth_m = own.dip_m + 2.0 * RESERVE_M;
-        // The slack is the margin less what speed takes; times 2 B, so that nothing is divided.
+        // The slack is the margin less what speed takes.
         before_m >= berth_m
             && after_m >= berth_m
             && 2.0 * b * (after_m - berth_m) >= shed * shed - w1_mps * w1_mps
