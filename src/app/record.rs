@@ -47,7 +47,7 @@ impl Recording {
         run_id: u64,
     ) -> Result<Recording, AppError> {
         // A generated network has no text.
-        let text = match arguments.corridors {
+        let text = match arguments.side_by_side {
             Some(_) => String::new(),
             None => text_of(arguments.scenario.as_deref())?,
         };

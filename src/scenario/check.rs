@@ -346,7 +346,9 @@ mod tests {
         let sets = ["controllers=[{name=\"a\",zones=[\"merge-1\"]},{name=\"b\",paths=[\"merge-2.main\"]}]"];
         let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
         assert_eq!(load(None, &sets, None).unwrap().check(), Ok(()));
-        assert_eq!(crate::bench::corridors(500, 60.0).unwrap().check(), Ok(()));
+        for family in [crate::bench::Family::Corridors, crate::bench::Family::Grids] {
+            assert_eq!(crate::bench::side_by_side(family, 500, 60.0).unwrap().check(), Ok(()));
+        }
     }
 
     fn faults(scenario: &mut Scenario) -> &mut Faults {
