@@ -107,6 +107,13 @@ impl Row {
             has_left: false,
         }
     }
+
+    /// Whether one that leaves by an exit, and passes later, has it behind itself on their common stretch. Who has left
+    /// the zone stands at the head of the order: before those of its own exit, all of whom it has passed; but of
+    /// others one may be inside that is ahead of it.
+    fn may_be_hidden_by(&self, own_exit: u32, exit: u32) -> bool {
+        !self.has_left || own_exit == exit
+    }
 }
 
 /// The duties of one zone's vehicles; kept from use to use for its allocations.
@@ -117,8 +124,10 @@ pub struct Duties {
     ends: Vec<u32>,
     /// The latest row of each way (path and next path), the latest last.
     latest: Vec<usize>,
-    covered: Vec<(f64, f64)>,
-    lanes: Vec<u32>,
+    /// Stretches of the row's way on which somebody nearer has been found, and the exit that one leaves by.
+    covered: Vec<(f64, f64, u32)>,
+    /// The same for lanes that cross.
+    lanes: Vec<(u32, u32)>,
 }
 
 impl Duties {
@@ -171,6 +180,7 @@ impl Duties {
         covered.clear();
         for &at in latest.iter().rev() {
             let other = &rows[at];
+            let exit = conflicts.exit(other.path);
             conflicts.runs((row.path, row.next_path), (other.path, other.next_path), |run| {
                 let until_m = run.other_from_m + (run.to_m - run.from_m) + other.length_m;
                 if row.x_m >= run.to_m || other.x_m >= until_m {
@@ -179,10 +189,13 @@ impl Duties {
                 // A newcomer may be a rounding before the origin.
                 let behind = row.x_m >= run.from_m || run.from_m == 0.0;
                 let from_m = if behind { f64::NEG_INFINITY } else { run.from_m };
-                if covered.iter().any(|&(from, to)| from <= from_m && to >= run.to_m) {
+                let hides = |&(from, to, of): &(f64, f64, u32)| {
+                    from <= from_m && to >= run.to_m && other.may_be_hidden_by(exit, of)
+                };
+                if covered.iter().any(hides) {
                     return;
                 }
-                covered.push((from_m, run.to_m));
+                covered.push((from_m, run.to_m, exit));
                 let point = conflicts.uses(row.path).iter().find(|u| !behind && u.at_m == run.from_m);
                 all.push(Duty {
                     kind: if behind { DutyKind::RearEnd } else { DutyKind::Merge },
@@ -194,7 +207,7 @@ impl Duties {
                     until_m,
                 });
             });
-            if covered.contains(&(f64::NEG_INFINITY, f64::INFINITY)) {
+            if conflicts.has_one_exit() && covered.contains(&(f64::NEG_INFINITY, f64::INFINITY, exit)) {
                 break;
             }
         }
@@ -213,10 +226,11 @@ impl Duties {
                 let other = &rows[at];
                 let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
                 let Some(theirs) = theirs.filter(|u| !u.on_lane_of(own)) else { continue };
-                if lanes.contains(&theirs.lane()) {
+                let exit = conflicts.exit(other.path);
+                if lanes.iter().any(|&(lane, of)| lane == theirs.lane() && other.may_be_hidden_by(exit, of)) {
                     continue;
                 }
-                lanes.push(theirs.lane());
+                lanes.push((theirs.lane(), exit));
                 let gap_m = point.area_m + other.length_m;
                 let until_m = theirs.at_m + gap_m + row.reach_m;
                 if other.x_m < until_m {

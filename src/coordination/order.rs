@@ -8,7 +8,7 @@ use super::assign::row;
 use crate::conflict::{Conflicts, Duties, Row};
 use crate::scenario::{PassingOrder, Scenario};
 use crate::shield::{Shield, yielding_slack_m};
-use ipc_schemas::VehicleState;
+use ipc_schemas::{STATE_ENTERED, VehicleState};
 
 /// A vehicle that lets a newcomer pass first keeps at least this much slack, m: it is not to brake hard for it.
 const YIELDING_SLACK_M: f64 = 0.5;
@@ -43,7 +43,9 @@ impl Orders {
                 order.extend(members.iter().map(|state| state.vehicle));
             }
             PassingOrder::PerPoint => {
-                order.retain(|vehicle| members.iter().any(|state| state.vehicle == *vehicle));
+                // One that has come back within a step, by a way from the zone to itself, is a newcomer too.
+                let stays = |state: &VehicleState| state.flags & STATE_ENTERED == 0;
+                order.retain(|vehicle| members.iter().any(|s| s.vehicle == *vehicle && stays(s)));
                 for state in members {
                     if !order.contains(&state.vehicle) {
                         let place = self.place(scenario, conflicts, members, order, state);

@@ -101,7 +101,8 @@ impl World {
         let first = self.zones[zone].first();
         let members = &self.cars[zone][first..];
         let Order { known, proposed, refused } = self.orders.entry(zone as u32).or_default();
-        known.retain(|vehicle| members.iter().any(|car| car.vehicle == *vehicle));
+        // One that has come back within a step, by a way from the zone to itself, is a newcomer too.
+        known.retain(|vehicle| members.iter().any(|car| car.vehicle == *vehicle && !car.visit.entered));
         for car in members {
             if !known.contains(&car.vehicle) {
                 known.push(car.vehicle);
