@@ -3,6 +3,8 @@
 //! The loader refuses with places and keys; here there are none, and whoever meets a fault holds a file that
 //! no version of this program wrote.
 
+use super::keys;
+use super::network::entrance_without_way_out;
 use super::ranges::{self, Range};
 use super::{
     Baseline, Demand, Exit, Faults, FlowPolicy, Network, Observed, Path, Poisson, Scenario, Scope,
@@ -26,44 +28,52 @@ fn number(what: &str, value: f64, within: impl FnOnce(f64) -> bool) -> Check {
     require(value.is_finite() && within(value), || format!("{what} = {value}"))
 }
 
-fn within(what: &str, value: f64, range: &Range) -> Check {
+fn inside(what: &str, value: f64, range: &Range) -> Check {
     number(what, value, |value| range.contains(value))
+}
+
+fn within(key: &keys::Number, value: f64) -> Check {
+    inside(key.name, value, &key.range)
 }
 
 impl Scenario {
     /// Checks every value and index as the loader does.
     pub fn check(&self) -> Result<(), ScenarioFault> {
         let dt_s = self.dt_s();
-        within("dt_s", dt_s, &ranges::STEP)?;
+        within(&keys::DT, dt_s)?;
         let longest_s = MAX_TIME_S.min(dt_s * ranges::MAX_STEPS);
         number("max_time_s", self.max_time_s, |t| t >= dt_s && t <= longest_s)?;
         require(self.max_vehicles != Some(0), || "max_vehicles = 0".to_owned())?;
-        within("beta", self.beta, &ranges::BETA)?;
+        within(&keys::BETA, self.beta)?;
         vehicle(&self.vehicle)?;
         require(!self.fleet.is_empty() && self.fleet.len() <= MAX_KINDS, || "the fleet".to_owned())?;
         for kind in &self.fleet {
             vehicle(&kind.vehicle)?;
-            within("share", kind.share, &ranges::SHARE)?;
+            within(&keys::SHARE, kind.share)?;
             // Steps and paths are sized for the fastest.
             number("v_max_mps", kind.vehicle.v_max_mps, |v| v <= self.vehicle.v_max_mps)?;
         }
         let control = &self.control;
-        for (what, gain) in [
-            ("k_rear_end_per_s", control.k_rear_end_per_s),
-            ("k_merge_per_s", control.k_merge_per_s),
-            ("k_speed_per_s", control.k_speed_per_s),
-            ("clf_rate_per_s", control.clf_rate_per_s),
+        for (key, value) in [
+            (&keys::K_REAR_END, control.k_rear_end_per_s),
+            (&keys::K_MERGE, control.k_merge_per_s),
+            (&keys::K_SPEED, control.k_speed_per_s),
+            (&keys::CLF_RATE, control.clf_rate_per_s),
+            (&keys::SLACK_WEIGHT, control.slack_weight),
         ] {
-            within(what, gain, &ranges::GAIN)?;
+            within(key, value)?;
         }
-        within("slack_weight", control.slack_weight, &ranges::SLACK_WEIGHT)?;
         let viable = &control.viable;
-        within("k_comfort_per_s", viable.k_comfort_per_s, &ranges::GAIN)?;
-        within("k_recovery_per_s", viable.k_recovery_per_s, &ranges::GAIN)?;
-        within("clearance_m", viable.clearance_m, &ranges::STANDSTILL_GAP)?;
-        within("buffer_m", viable.buffer_m, &ranges::STANDSTILL_GAP)?;
-        within("buffer_s", viable.buffer_s, &ranges::REACTION_TIME)?;
-        within("passage_weight", viable.passage_weight, &ranges::SHARE)?;
+        for (key, value) in [
+            (&keys::K_COMFORT, viable.k_comfort_per_s),
+            (&keys::K_RECOVERY, viable.k_recovery_per_s),
+            (&keys::CLEARANCE, viable.clearance_m),
+            (&keys::BUFFER, viable.buffer_m),
+            (&keys::BUFFER_TIME, viable.buffer_s),
+            (&keys::PASSAGE_WEIGHT, viable.passage_weight),
+        ] {
+            within(key, value)?;
+        }
         number("fe_fraction", control.fe_fraction, |f| f > 0.0 && f <= 1.0)?;
         network(&self.network, self.vehicle.v_max_mps * dt_s, self.vehicle.v_max_mps)?;
         for exit in self.network.zones.iter().flat_map(|zone| &zone.exits) {
@@ -144,14 +154,14 @@ fn span(span: &Span) -> Check {
 }
 
 fn vehicle(v: &VehicleParams) -> Check {
-    within("u_min_mps2", v.u_min_mps2, &ranges::BRAKING)?;
-    within("u_max_mps2", v.u_max_mps2, &ranges::ACCELERATION)?;
-    within("v_min_mps", v.v_min_mps, &ranges::LEAST_SPEED)?;
-    within("v_max_mps", v.v_max_mps, &ranges::GREATEST_SPEED)?;
+    within(&keys::U_MIN, v.u_min_mps2)?;
+    within(&keys::U_MAX, v.u_max_mps2)?;
+    within(&keys::V_MIN, v.v_min_mps)?;
+    within(&keys::V_MAX, v.v_max_mps)?;
     number("v_max_mps", v.v_max_mps, |s| s > v.v_min_mps)?;
-    within("length_m", v.length_m, &ranges::VEHICLE_LENGTH)?;
-    within("reaction_time_s", v.reaction_time_s, &ranges::REACTION_TIME)?;
-    within("standstill_gap_m", v.standstill_gap_m, &ranges::STANDSTILL_GAP)
+    within(&keys::LENGTH, v.length_m)?;
+    within(&keys::REACTION_TIME, v.reaction_time_s)?;
+    within(&keys::STANDSTILL_GAP, v.standstill_gap_m)
 }
 
 /// Indices point at something, both ends of a connection know of each other, and every zone has a way out.
@@ -183,26 +193,17 @@ fn network(network: &Network, step_m: f64, v_max_mps: f64) -> Check {
             let there = zones.get(to.zone as usize).and_then(|z| z.segments.get(to.segment as usize));
             let source = Source::Zone { zone: index, exit: at };
             require(there.is_some_and(|segment| segment.source == Some(source)), bad)?;
-            within("link_m", to.link_m, &ranges::LINK_LENGTH)?;
+            inside("link_m", to.link_m, &ranges::LINK_LENGTH)?;
             number("link_m", to.link_m, |l| l == 0.0 || l >= step_m)?;
             let is_speed = |v| ranges::LINK_SPEED.contains(v) && v <= v_max_mps;
             number("link_speed_mps", to.link_speed_mps, is_speed)?;
         }
     }
-    let is_way_out = |zone: &Zone| zone.exits.iter().any(|exit| exit.to.is_none());
-    let mut has_way: Vec<bool> = zones.iter().map(is_way_out).collect();
-    let mut found: Vec<usize> = (0..zones.len()).filter(|&zone| has_way[zone]).collect();
-    while let Some(zone) = found.pop() {
-        for feeder in network.upstream(zone as u32) {
-            if !std::mem::replace(&mut has_way[feeder as usize], true) {
-                found.push(feeder as usize);
-            }
-        }
-    }
-    require(has_way.iter().all(|has| *has), || "a zone from which nobody comes out".to_owned())?;
+    let has_way_out = entrance_without_way_out(zones).is_none();
+    require(has_way_out, || "an entrance from which nobody comes out".to_owned())?;
     for road in roads {
         for route in &road.routes {
-            within("share", route.share, &ranges::SHARE)?;
+            within(&keys::SHARE, route.share)?;
             let (mut at, mut segment) = (Some(road.zone), road.segment);
             for &path in &route.paths {
                 let zone = at.map(|zone| &zones[zone as usize]);
@@ -225,7 +226,7 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
     let mut is_used = vec![false; zone.segments.len()];
     let mut is_left_by = vec![false; zone.exits.len()];
     for segment in &zone.segments {
-        within("length_m", segment.length_m, &ranges::SEGMENT_LENGTH)?;
+        inside("length_m", segment.length_m, &ranges::SEGMENT_LENGTH)?;
         require(segment.shape.iter().flatten().all(|m| m.abs() <= 1e7), bad)?;
         require(segment.shape.len() != 1, bad)?;
     }
@@ -240,15 +241,15 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
             length_m += segment.map_or(0.0, |s| s.length_m);
         }
         require(path.length_m == length_m, bad)?;
-        within("length_m", length_m, &ranges::APPROACH_LENGTH)?;
+        inside("length_m", length_m, &ranges::APPROACH_LENGTH)?;
         number("length_m", length_m, |l| l >= step_m)?;
-        within("share", path.share, &ranges::SHARE)?;
+        within(&keys::SHARE, path.share)?;
         require((path.exit as usize) < zone.exits.len(), bad)?;
         is_left_by[path.exit as usize] = true;
     }
     require(is_used.iter().chain(&is_left_by).all(|used| *used), bad)?;
     for crossing in &zone.crossings {
-        within("length_m", crossing.length_m, &ranges::CROSSING_LENGTH)?;
+        inside("length_m", crossing.length_m, &ranges::CROSSING_LENGTH)?;
         require(crossing.places.len() >= 2, bad)?;
         for &(segment, at_m) in &crossing.places {
             let segment = zone.segments.get(segment as usize);
@@ -281,7 +282,7 @@ fn flow(exit: &Exit, network: &Network, v_max_mps: f64) -> Check {
                     speeds.iter().try_for_each(|v| speed("baseline_entry_speeds_mps", *v))?;
                 }
             }
-            within("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
+            inside("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
             speed("min_mps", *min_mps)?;
             match segment {
                 Observed::Whole => Ok(()),
@@ -290,8 +291,8 @@ fn flow(exit: &Exit, network: &Network, v_max_mps: f64) -> Check {
         }
         FlowPolicy::MeanSpeed { offset_mps, gain_mps, segment_m, min_mps } => {
             has_downstream()?;
-            within("offset_mps", *offset_mps, &ranges::FLOW_OFFSET)?;
-            within("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
+            inside("offset_mps", *offset_mps, &ranges::FLOW_OFFSET)?;
+            inside("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
             speed("min_mps", *min_mps)?;
             observes(*segment_m)
         }
@@ -314,7 +315,7 @@ fn demand(demand: &Demand, vehicle: &VehicleParams, routes: usize) -> Check {
             return Ok(());
         }
     };
-    within("min_headway_s", *min_headway_s, &ranges::HEADWAY)?;
+    inside("min_headway_s", *min_headway_s, &ranges::HEADWAY)?;
     let mut last_s = 0.0;
     for period in rates {
         number("until_s", period.until_s, |t| t > last_s && t <= MAX_TIME_S)?;

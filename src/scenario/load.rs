@@ -19,7 +19,7 @@ mod topology;
 pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;
 
-use super::{EntryRule, LawKind, Network, Road, Scenario, ShieldMode, embedded, ranges};
+use super::{EntryRule, LawKind, Network, Road, Scenario, embedded, keys, ranges};
 use demand::{DemandReader, TraceBase};
 pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
@@ -148,22 +148,7 @@ fn load_text(
 
 fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError> {
     let root = Table::root(document);
-    root.only(&[
-        "name",
-        "seed",
-        "dt_s",
-        "end",
-        "vehicle",
-        "objective",
-        "control",
-        "gate",
-        "shield",
-        "fleet",
-        "roads",
-        "zones",
-        "controllers",
-        "faults",
-    ])?;
+    root.only_declared(keys::ROOT)?;
     let name = root.name()?.to_owned();
     let seed = match root.get("seed") {
         Some(field) => field.integer(0, "an integer from 0 to 2^64 - 1")?,
@@ -183,10 +168,10 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let road_tables = root.tables("roads", "a list of entry roads, at least one")?;
     let zone_tables = root.tables("zones", "a list of zones, at least one")?;
     for table in &road_tables {
-        table.only(&["name", "demand", "routes", "entry"])?;
+        table.only_declared(keys::ROADS)?;
     }
     for table in &zone_tables {
-        table.only(&topology::ZONE_KEYS)?;
+        table.only_declared(keys::ZONES)?;
     }
     let law = sections::law(control_table.as_ref(), LawKind::default())?;
     let road_names = topology::unique_names(&road_tables, "road")?;
@@ -209,7 +194,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let mut reader = DemandReader { base, seed, roads: road_names, routes, vehicle, traces: BTreeMap::new() };
     let gate = section("gate")?;
     if let Some(table) = &gate {
-        table.only(&["entry"])?;
+        table.only_declared(keys::GATE)?;
     }
     let entry_everywhere = sections::entry(gate.as_ref(), EntryRule::default())?;
     let mut roads = Vec::with_capacity(road_tables.len());
@@ -221,10 +206,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         roads.push(Road { name, zone, segment, demand, routes, entry });
     }
     let plugins = plugins::read(&root, &topology.zones)?;
-    let shield = root.choice_or_first(
-        "shield",
-        &[("off", ShieldMode::Off), ("observe", ShieldMode::Observe), ("on", ShieldMode::On)],
-    )?;
+    let shield = root.chosen(&keys::SHIELD)?;
     let faults = faults::read(section("faults")?.as_ref(), &topology.zones)?;
     let network = Network { zones: topology.zones, roads };
     Ok(Scenario {
@@ -272,21 +254,22 @@ fn flow_policies(
 
 /// `dt_s` as nanoseconds.
 fn dt_ns(root: &Table<'_>) -> Result<u64, ScenarioError> {
-    let expected = format!("{}, a whole number of nanoseconds", ranges::STEP);
+    let range = keys::DT.range;
+    let expected = format!("{range}, a whole number of nanoseconds");
     // Decimal fractions of a second are not exact in binary: a relative error of some bits is no fraction
     // of a nanosecond.
     let whole = |dt_s: f64| {
         let ns = dt_s * 1e9;
-        ranges::STEP.contains(dt_s) && (ns - ns.round()).abs() <= 1e-12 * ns
+        range.contains(dt_s) && (ns - ns.round()).abs() <= 1e-12 * ns
     };
-    Ok((root.f64_or("dt_s", 0.1, whole, &expected)? * 1e9).round() as u64)
+    Ok((root.f64_or(keys::DT.name, keys::DT.default(), whole, &expected)? * 1e9).round() as u64)
 }
 
 /// `[end]`: greatest number of vehicles, and time in s.
 fn end(table: Option<&Table<'_>>, dt_s: f64) -> Result<(Option<u32>, f64), ScenarioError> {
     const DEFAULT_TIME_S: f64 = 7200.0;
     let Some(t) = table else { return Ok((None, DEFAULT_TIME_S)) };
-    t.only(&["vehicles", "time_s"])?;
+    t.only_declared(keys::END)?;
     let vehicles = match t.get("vehicles") {
         Some(field) => Some(field.integer(1, "an integer from 1 to 4294967295")?),
         None => None,

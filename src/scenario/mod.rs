@@ -11,6 +11,7 @@ pub(crate) mod draw;
 mod embedded;
 pub mod encode;
 pub mod faults;
+mod keys;
 pub mod layout;
 pub mod load;
 pub mod network;
@@ -26,6 +27,7 @@ pub use circles::Circles;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use encode::{DecodeError, decode, encode, keep, kept, scenario_hash};
 pub use faults::{CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall};
+pub use keys::document as keys_document;
 pub use load::{
     DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
     load_recorded, text_of,

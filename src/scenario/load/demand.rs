@@ -2,6 +2,7 @@
 
 use super::error::{Place, ScenarioError, nearest};
 use super::table::{Field, Table};
+use crate::scenario::keys;
 use crate::scenario::{
     Arrival, Demand, Poisson, RatePeriod, Route, SpeedDistribution, VehicleParams, ranges,
 };
@@ -44,13 +45,12 @@ impl DemandReader<'_> {
         const EXPECTED: &str =
             "a table with trace = \"FILE.csv\", or with rates and the other keys of random arrivals";
         const OTHER_SEEDS: &str = "trace and rates, where trace_seeds lists the seeds that have a trace";
-        const POISSON: [&str; 6] =
-            ["rates", "min_headway_s", "speed_mean_mps", "speed_sd_mps", "speed_min_mps", "speed_max_mps"];
+        let random = keys::names(keys::RANDOM);
         let mut t = table.need("demand", EXPECTED)?.table(EXPECTED)?;
-        t.only(&[&["trace", "trace_seeds"][..], &POISSON].concat())?;
+        t.only(&[&keys::names(keys::TRACE)[..], &random].concat())?;
         if let Some(seeds) = t.get("trace_seeds") {
             let (trace, rates) = (t.need("trace", OTHER_SEEDS)?, t.need("rates", OTHER_SEEDS)?);
-            let random_is_set = POISSON.iter().any(|key| t.get(key).is_some_and(|field| field.is_set()));
+            let random_is_set = random.iter().any(|key| t.get(key).is_some_and(|field| field.is_set()));
             // Whoever sets one of the two by hand means that one, whatever the seed.
             let takes_trace = match (trace.is_set(), random_is_set) {
                 (true, false) if !seeds.is_set() => true,
@@ -69,11 +69,11 @@ impl DemandReader<'_> {
                 Err(rates.bad_because(Some("trace is given as well".into()), "either trace or rates"))
             }
             (Some(trace), None) => {
-                t.only_or_stale(&["trace"], if trace.is_set() { &POISSON } else { &[] })?;
+                t.only_or_stale(&["trace"], if trace.is_set() { &random[..] } else { &[] })?;
                 self.trace(road, &trace)
             }
             (None, Some(rates)) => {
-                t.only_or_stale(&POISSON, &["trace"])?;
+                t.only_or_stale(&random, &["trace"])?;
                 t.blame(&rates);
                 self.poisson(&t, &rates)
             }

@@ -14,7 +14,7 @@ pub(in crate::scenario) const MAX_DELAY: u32 = 1000;
 /// Reads `[faults]`; an empty table is none.
 pub(super) fn read(table: Option<&Table<'_>>, zones: &[Zone]) -> Result<Option<Faults>, ScenarioError> {
     let Some(t) = table else { return Ok(None) };
-    t.only(&["noise", "sensors", "commands", "stalls"])?;
+    t.only_declared(crate::scenario::keys::FAULTS)?;
     let mut faults = Faults::default();
     if let Some(field) = t.get("noise") {
         faults.noise = Some(noise(&field.table("a table such as {position_sd_m = 0.5}")?)?);

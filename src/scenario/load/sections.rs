@@ -3,8 +3,8 @@
 use super::error::ScenarioError;
 use super::table::Table;
 use crate::scenario::{
-    Baseline, ControlParams, EntryRule, FeConditions, FlowPolicy, LawKind, Observed, PositionFeedback,
-    ReferenceLaw, Replan, SafetyRows, Solver, VehicleKind, VehicleParams, ViableParams, ranges,
+    Baseline, ControlParams, EntryRule, FlowPolicy, LawKind, Observed, VehicleKind, VehicleParams,
+    ViableParams, keys, ranges,
 };
 
 /// No more kinds of vehicles than this.
@@ -13,35 +13,32 @@ pub(in crate::scenario) const MAX_KINDS: usize = 64;
 /// `[vehicle]`, or the defaults.
 pub(super) fn vehicle(table: Option<&Table<'_>>) -> Result<VehicleParams, ScenarioError> {
     let mut params = VehicleParams {
-        u_min_mps2: -4.0,
-        u_max_mps2: 4.0,
-        v_min_mps: 0.0,
-        v_max_mps: 30.0,
-        length_m: 4.5,
-        reaction_time_s: 1.8,
-        standstill_gap_m: 0.0,
+        u_min_mps2: keys::U_MIN.default(),
+        u_max_mps2: keys::U_MAX.default(),
+        v_min_mps: keys::V_MIN.default(),
+        v_max_mps: keys::V_MAX.default(),
+        length_m: keys::LENGTH.default(),
+        reaction_time_s: keys::REACTION_TIME.default(),
+        standstill_gap_m: keys::STANDSTILL_GAP.default(),
     };
     let Some(t) = table else { return Ok(params) };
-    t.only(&VEHICLE_KEYS)?;
+    t.only_declared(keys::VEHICLE)?;
     read_vehicle(t, &mut params)?;
     Ok(params)
 }
 
-const VEHICLE_KEYS: [&str; 7] =
-    ["u_min_mps2", "u_max_mps2", "v_min_mps", "v_max_mps", "length_m", "reaction_time_s", "standstill_gap_m"];
-
 /// Reads what a table says of vehicles; what it does not say stays as it is.
 fn read_vehicle(t: &Table<'_>, p: &mut VehicleParams) -> Result<(), ScenarioError> {
-    p.u_min_mps2 = t.within_or("u_min_mps2", p.u_min_mps2, &ranges::BRAKING)?;
-    p.u_max_mps2 = t.within_or("u_max_mps2", p.u_max_mps2, &ranges::ACCELERATION)?;
-    p.v_min_mps = t.within_or("v_min_mps", p.v_min_mps, &ranges::LEAST_SPEED)?;
-    let v_min = p.v_min_mps;
-    let is_greatest = |v| v > v_min && ranges::GREATEST_SPEED.contains(v);
-    let expected = format!("{}, > v_min_mps = {v_min}", ranges::GREATEST_SPEED);
-    p.v_max_mps = t.f64_or("v_max_mps", p.v_max_mps, is_greatest, &expected)?;
-    p.length_m = t.within_or("length_m", p.length_m, &ranges::VEHICLE_LENGTH)?;
-    p.reaction_time_s = t.within_or("reaction_time_s", p.reaction_time_s, &ranges::REACTION_TIME)?;
-    p.standstill_gap_m = t.within_or("standstill_gap_m", p.standstill_gap_m, &ranges::STANDSTILL_GAP)?;
+    p.u_min_mps2 = t.number_or(&keys::U_MIN, p.u_min_mps2)?;
+    p.u_max_mps2 = t.number_or(&keys::U_MAX, p.u_max_mps2)?;
+    p.v_min_mps = t.number_or(&keys::V_MIN, p.v_min_mps)?;
+    let (v_min, range) = (p.v_min_mps, keys::V_MAX.range);
+    let is_greatest = |v| v > v_min && range.contains(v);
+    p.v_max_mps =
+        t.f64_or(keys::V_MAX.name, p.v_max_mps, is_greatest, &format!("{range}, > v_min_mps = {v_min}"))?;
+    p.length_m = t.number_or(&keys::LENGTH, p.length_m)?;
+    p.reaction_time_s = t.number_or(&keys::REACTION_TIME, p.reaction_time_s)?;
+    p.standstill_gap_m = t.number_or(&keys::STANDSTILL_GAP, p.standstill_gap_m)?;
     Ok(())
 }
 
@@ -54,7 +51,7 @@ pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<Veh
     let names = super::topology::unique_names(&tables, "kind of vehicle")?;
     let mut kinds = Vec::with_capacity(tables.len());
     for (t, name) in tables.iter().zip(names) {
-        t.only(&[&["name", "share"][..], &VEHICLE_KEYS].concat())?;
+        t.only_declared(keys::FLEET)?;
         if kinds.len() == MAX_KINDS {
             return Err(t.need("name", "")?.bad(&format!("at most {MAX_KINDS} kinds")));
         }
@@ -64,7 +61,7 @@ pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<Veh
             let expected = format!("at most that of [vehicle], {} m/s", vehicle.v_max_mps);
             return Err(t.need("v_max_mps", &expected)?.bad(&expected));
         }
-        let share = t.within_or("share", 1.0, &ranges::SHARE)?;
+        let share = t.number_or(&keys::SHARE, keys::SHARE.default())?;
         kinds.push(VehicleKind { name: name.to_owned(), share, vehicle: own });
     }
     Ok(kinds)
@@ -82,24 +79,20 @@ pub(super) fn law(table: Option<&Table<'_>>, default: LawKind) -> Result<LawKind
 pub(super) fn entry(table: Option<&Table<'_>>, default: EntryRule) -> Result<EntryRule, ScenarioError> {
     match table.and_then(|t| t.get("entry")) {
         None => Ok(default),
-        Some(field) => field.choice(&[
-            ("free", EntryRule::Free),
-            ("viable", EntryRule::Viable),
-            ("room_to_stop", EntryRule::RoomToStop),
-        ]),
+        Some(field) => field.choice(keys::ENTRY.words),
     }
 }
 
 /// `[objective]`: beta, in m^2/s^4, given or from alpha.
 pub(super) fn beta(table: &Table<'_>, vehicle: &VehicleParams) -> Result<f64, ScenarioError> {
     const ALPHA: &str = "a weight with 0 < alpha < 1";
-    table.only(&["alpha", "beta"])?;
+    table.only_declared(keys::OBJECTIVE)?;
     match table.either("alpha", "beta") {
         (Some(_), Some(beta)) => {
             Err(beta.bad_because(Some("alpha is given as well".into()), "either alpha or beta"))
         }
         (None, None) => Err(table.missing("beta", &format!("{}, or alpha instead", ranges::BETA))),
-        (None, Some(beta)) => beta.within(&ranges::BETA),
+        (None, Some(_)) => table.number(&keys::BETA),
         (Some(field), None) => {
             let alpha = field.f64(|a| a > 0.0 && a < 1.0, ALPHA)?;
             let u = vehicle.u_max_mps2.max(-vehicle.u_min_mps2);
@@ -116,74 +109,43 @@ pub(super) fn beta(table: &Table<'_>, vehicle: &VehicleParams) -> Result<f64, Sc
 
 /// `[control]`, or the defaults; `beta` is the default slack weight.
 pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlParams, ScenarioError> {
+    const FE_FRACTION: f64 = 0.25;
     let mut params = ControlParams {
-        reference: ReferenceLaw::Corrected,
-        replan: Replan::FromEntry,
-        position_feedback: PositionFeedback::Approximate,
-        solver: Solver::ClosedForm,
-        safety_rows: SafetyRows::Continuous,
-        k_rear_end_per_s: 1.0,
-        k_merge_per_s: 1.0,
-        k_speed_per_s: 1.0,
-        clf_rate_per_s: 10.0,
+        reference: keys::REFERENCE.default(),
+        replan: keys::REPLAN.default(),
+        position_feedback: keys::POSITION_FEEDBACK.default(),
+        solver: keys::SOLVER.default(),
+        safety_rows: keys::SAFETY_ROWS.default(),
+        k_rear_end_per_s: keys::K_REAR_END.default(),
+        k_merge_per_s: keys::K_MERGE.default(),
+        k_speed_per_s: keys::K_SPEED.default(),
+        clf_rate_per_s: keys::CLF_RATE.default(),
         slack_weight: beta,
-        clf: true,
-        feasibility_rows: true,
-        fe_conditions: FeConditions::Full,
-        fe_fraction: 0.25,
+        clf: keys::CLF.default,
+        feasibility_rows: keys::FEASIBILITY_ROWS.default,
+        fe_conditions: keys::FE_CONDITIONS.default(),
+        fe_fraction: FE_FRACTION,
         viable: ViableParams::DEFAULT,
     };
     let Some(t) = table else { return Ok(params) };
-    t.only(&[
-        "law",
-        "reference",
-        "replan",
-        "position_feedback",
-        "solver",
-        "safety_rows",
-        "k_rear_end_per_s",
-        "k_merge_per_s",
-        "k_speed_per_s",
-        "clf_rate_per_s",
-        "slack_weight",
-        "clf",
-        "feasibility_rows",
-        "fe_conditions",
-        "fe_fraction",
-        "viable",
-    ])?;
-    let gain = |key, default| t.within_or(key, default, &ranges::GAIN);
+    t.only_declared(keys::CONTROL)?;
     let p = &mut params;
-    p.reference = t.choice_or_first(
-        "reference",
-        &[("corrected", ReferenceLaw::Corrected), ("as_printed", ReferenceLaw::AsPrinted)],
-    )?;
-    p.replan =
-        t.choice_or_first("replan", &[("from_entry", Replan::FromEntry), ("from_state", Replan::FromState)])?;
-    p.position_feedback = t.choice_or_first(
-        "position_feedback",
-        &[("approximate", PositionFeedback::Approximate), ("exact", PositionFeedback::Exact)],
-    )?;
-    p.solver =
-        t.choice_or_first("solver", &[("closed_form", Solver::ClosedForm), ("clarabel", Solver::Clarabel)])?;
-    p.safety_rows = t.choice_or_first(
-        "safety_rows",
-        &[("continuous", SafetyRows::Continuous), ("sampled", SafetyRows::Sampled)],
-    )?;
-    p.k_rear_end_per_s = gain("k_rear_end_per_s", p.k_rear_end_per_s)?;
-    p.k_merge_per_s = gain("k_merge_per_s", p.k_merge_per_s)?;
-    p.k_speed_per_s = gain("k_speed_per_s", p.k_speed_per_s)?;
-    p.clf_rate_per_s = gain("clf_rate_per_s", p.clf_rate_per_s)?;
-    p.slack_weight = t.within_or("slack_weight", p.slack_weight, &ranges::SLACK_WEIGHT)?;
-    p.clf = t.bool_or("clf", p.clf)?;
-    p.feasibility_rows = t.bool_or("feasibility_rows", p.feasibility_rows)?;
-    p.fe_conditions = t.choice_or_first(
-        "fe_conditions",
-        &[("full", FeConditions::Full), ("barrier", FeConditions::Barrier), ("off", FeConditions::Off)],
-    )?;
+    p.reference = t.chosen(&keys::REFERENCE)?;
+    p.replan = t.chosen(&keys::REPLAN)?;
+    p.position_feedback = t.chosen(&keys::POSITION_FEEDBACK)?;
+    p.solver = t.chosen(&keys::SOLVER)?;
+    p.safety_rows = t.chosen(&keys::SAFETY_ROWS)?;
+    p.k_rear_end_per_s = t.number_or(&keys::K_REAR_END, p.k_rear_end_per_s)?;
+    p.k_merge_per_s = t.number_or(&keys::K_MERGE, p.k_merge_per_s)?;
+    p.k_speed_per_s = t.number_or(&keys::K_SPEED, p.k_speed_per_s)?;
+    p.clf_rate_per_s = t.number_or(&keys::CLF_RATE, p.clf_rate_per_s)?;
+    p.slack_weight = t.number_or(&keys::SLACK_WEIGHT, p.slack_weight)?;
+    p.clf = t.flag(&keys::CLF)?;
+    p.feasibility_rows = t.flag(&keys::FEASIBILITY_ROWS)?;
+    p.fe_conditions = t.chosen(&keys::FE_CONDITIONS)?;
     p.fe_fraction = t.f64_or(
         "fe_fraction",
-        p.fe_fraction,
+        FE_FRACTION,
         |f| f > 0.0 && f <= 1.0,
         "a fraction with 0 < fe_fraction <= 1",
     )?;
@@ -195,30 +157,19 @@ pub(super) fn control(table: Option<&Table<'_>>, beta: f64) -> Result<ControlPar
 
 /// `control.viable`.
 fn viable(t: &Table<'_>) -> Result<ViableParams, ScenarioError> {
-    t.only(&[
-        "viability",
-        "comfort",
-        "bodies",
-        "slots",
-        "k_comfort_per_s",
-        "k_recovery_per_s",
-        "clearance_m",
-        "buffer_m",
-        "buffer_s",
-        "passage_weight",
-    ])?;
+    t.only_declared(keys::VIABLE)?;
     let default = ViableParams::DEFAULT;
     Ok(ViableParams {
-        viability: t.bool_or("viability", default.viability)?,
-        comfort: t.bool_or("comfort", default.comfort)?,
-        bodies: t.bool_or("bodies", default.bodies)?,
-        slots: t.bool_or("slots", default.slots)?,
-        k_comfort_per_s: t.within_or("k_comfort_per_s", default.k_comfort_per_s, &ranges::GAIN)?,
-        k_recovery_per_s: t.within_or("k_recovery_per_s", default.k_recovery_per_s, &ranges::GAIN)?,
-        clearance_m: t.within_or("clearance_m", default.clearance_m, &ranges::STANDSTILL_GAP)?,
-        buffer_m: t.within_or("buffer_m", default.buffer_m, &ranges::STANDSTILL_GAP)?,
-        buffer_s: t.within_or("buffer_s", default.buffer_s, &ranges::REACTION_TIME)?,
-        passage_weight: t.within_or("passage_weight", default.passage_weight, &ranges::SHARE)?,
+        viability: t.flag(&keys::VIABILITY)?,
+        comfort: t.flag(&keys::COMFORT)?,
+        bodies: t.flag(&keys::BODIES)?,
+        slots: t.flag(&keys::SLOTS)?,
+        k_comfort_per_s: t.number_or(&keys::K_COMFORT, default.k_comfort_per_s)?,
+        k_recovery_per_s: t.number_or(&keys::K_RECOVERY, default.k_recovery_per_s)?,
+        clearance_m: t.number_or(&keys::CLEARANCE, default.clearance_m)?,
+        buffer_m: t.number_or(&keys::BUFFER, default.buffer_m)?,
+        buffer_s: t.number_or(&keys::BUFFER_TIME, default.buffer_s)?,
+        passage_weight: t.number_or(&keys::PASSAGE_WEIGHT, default.passage_weight)?,
     })
 }
 
@@ -244,16 +195,7 @@ pub(super) fn flow(
     let Some(field) = zone.get("flow") else { return Ok(FlowPolicy::None) };
     const POLICY: &str = "a table such as {policy = \"fixed\", terminal_mps = 15}";
     let mut t = field.table(POLICY)?;
-    let all = [
-        "policy",
-        "terminal_mps",
-        "baseline_mps",
-        "baseline_entry_speeds_mps",
-        "gain_mps",
-        "segment_m",
-        "min_mps",
-        "offset_mps",
-    ];
+    let all = keys::names(keys::FLOW);
     // Without a policy the other keys cannot be judged; a misspelt "policy" is still found here.
     t.only(&all)?;
     let policy = t.need("policy", "\"none\", \"fixed\", \"feedback\" or \"mean_speed\"")?;
@@ -271,7 +213,7 @@ pub(super) fn flow(
         }
         Kind::MeanSpeed => &["policy", "offset_mps", "gain_mps", "segment_m", "min_mps"],
     };
-    t.only_or_stale(known, if policy.is_set() { &all } else { &[] })?;
+    t.only_or_stale(known, if policy.is_set() { &all[..] } else { &[] })?;
     t.blame(&policy);
 
     let v_max = vehicle.v_max_mps;

@@ -2,6 +2,7 @@
 
 use super::document::{Document, Node, Origin, Value};
 use super::error::{Place, ScenarioError, nearest, printable};
+use crate::scenario::keys::{self, Choice, Flag, Keys, Number};
 use crate::scenario::ranges::Range;
 use std::collections::BTreeMap;
 
@@ -70,6 +71,11 @@ impl<'a> Table<'a> {
                 suggestion: nearest(key, known.iter().copied()),
             }),
         }
+    }
+
+    /// Refuses keys other than those declared.
+    pub(super) fn only_declared(&self, keys: Keys) -> Result<(), ScenarioError> {
+        self.only(&keys::names(keys))
     }
 
     /// Where the table starts.
@@ -141,6 +147,26 @@ impl<'a> Table<'a> {
             None if ok(default) => Ok(default),
             None => Err(self.missing(key, &format!("{expected} (the default {default} is not)"))),
         }
+    }
+
+    /// The number of a declared key, which must be there.
+    pub(super) fn number(&self, key: &Number) -> Result<f64, ScenarioError> {
+        self.within(key.name, &key.range)
+    }
+
+    /// The number of a declared key, or another.
+    pub(super) fn number_or(&self, key: &Number, default: f64) -> Result<f64, ScenarioError> {
+        self.within_or(key.name, default, &key.range)
+    }
+
+    /// The word of a declared key, or its first.
+    pub(super) fn chosen<T: Copy>(&self, key: &Choice<T>) -> Result<T, ScenarioError> {
+        self.choice_or_first(key.name, key.words)
+    }
+
+    /// `true` or `false`, or the key's default.
+    pub(super) fn flag(&self, key: &Flag) -> Result<bool, ScenarioError> {
+        self.bool_or(key.name, key.default)
     }
 
     /// A number within a range.
