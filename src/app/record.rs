@@ -1,8 +1,7 @@
 //! `cz run --record`, `cz verify`, `cz replay`.
 
 use super::args::{ReplayArgs, ScenarioArgs, ShareArgs, VerifyArgs};
-use super::say::say;
-use super::show::number;
+use super::say::{number, say};
 use super::{AppError, print};
 use crate::process::RecordLag;
 use crate::record::{

@@ -26,7 +26,7 @@ impl Family {
     fn vehicles_each(self) -> f64 {
         match self {
             Family::Corridors => 10.4,
-            Family::Grids => 36.0,
+            Family::Grids => 26.3,
         }
     }
 

@@ -3,38 +3,14 @@
 //! The loader refuses with places and keys; here there are none, and whoever meets a fault holds a file that
 //! no version of this program wrote.
 
+use super::fault::{Check, ScenarioFault, inside, number, require, within};
 use super::keys;
 use super::network::entrance_without_way_out;
-use super::ranges::{self, Range};
+use super::ranges::{self, MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_KINDS, MAX_RATE_PER_HOUR, MAX_TIME_S};
 use super::{
-    Baseline, Demand, Exit, Faults, FlowPolicy, Network, Observed, Path, Poisson, Scenario, Scope,
-    SensorKind, Source, Span, VehicleParams, Zone,
+    Demand, Faults, Network, Path, Poisson, Scenario, Scope, SensorKind, Source, Span, VehicleParams, Zone,
+    flow,
 };
-use crate::scenario::load::{MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_KINDS, MAX_RATE_PER_HOUR, MAX_TIME_S};
-
-/// The first thing in a scenario that is not as the loader leaves it.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct ScenarioFault(String);
-
-type Check = Result<(), ScenarioFault>;
-
-fn require(holds: bool, what: impl FnOnce() -> String) -> Check {
-    if holds { Ok(()) } else { Err(ScenarioFault(what())) }
-}
-
-/// Whether a number is finite and within a range; NaN is in none.
-fn number(what: &str, value: f64, within: impl FnOnce(f64) -> bool) -> Check {
-    require(value.is_finite() && within(value), || format!("{what} = {value}"))
-}
-
-fn inside(what: &str, value: f64, range: &Range) -> Check {
-    number(what, value, |value| range.contains(value))
-}
-
-fn within(key: &keys::Number, value: f64) -> Check {
-    inside(key.name, value, &key.range)
-}
 
 impl Scenario {
     /// Checks every value and index as the loader does.
@@ -77,11 +53,11 @@ impl Scenario {
         number("fe_fraction", control.fe_fraction, |f| f > 0.0 && f <= 1.0)?;
         network(&self.network, self.vehicle.v_max_mps * dt_s, self.vehicle.v_max_mps)?;
         for exit in self.network.zones.iter().flat_map(|zone| &zone.exits) {
-            flow(exit, &self.network, self.vehicle.v_max_mps)?;
+            flow::check(exit, &self.network, self.vehicle.v_max_mps)?;
         }
         for road in &self.network.roads {
             demand(&road.demand, &self.vehicle, road.routes.len())
-                .map_err(|fault| ScenarioFault(format!("road {}: {fault}", road.name)))?;
+                .map_err(|fault| ScenarioFault::of(format!("road {}: {fault}", road.name)))?;
         }
         self.check_plugins()?;
         self.faults.as_ref().map_or(Ok(()), |faults| self.check_faults(faults))
@@ -259,44 +235,6 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
         require(zone.paths.iter().all(|path| passed(path) <= 1), bad)?;
     }
     Ok(())
-}
-
-fn flow(exit: &Exit, network: &Network, v_max_mps: f64) -> Check {
-    let speed = |what, value| number(what, value, |v| ranges::FLOW_SPEED.contains(v) && v <= v_max_mps);
-    let downstream = exit.to.map(|to| &network.zones[to.zone as usize]);
-    let observes = |l: f64| {
-        let longest_m = downstream.map_or(0.0, Zone::longest_m);
-        number("segment_m", l, |l| l > 0.0 && l <= longest_m)
-    };
-    let has_downstream =
-        || require(downstream.is_some(), || format!("exit {}: nothing to observe", exit.name));
-    match &exit.flow {
-        FlowPolicy::None => Ok(()),
-        FlowPolicy::Fixed { terminal_mps } => speed("terminal_mps", *terminal_mps),
-        FlowPolicy::Feedback { baseline, gain_mps, segment, min_mps } => {
-            has_downstream()?;
-            match baseline {
-                Baseline::Given(baseline) => speed("baseline_mps", *baseline)?,
-                Baseline::Optimal(speeds) => {
-                    require(!speeds.is_empty(), || "no baseline_entry_speeds_mps".to_owned())?;
-                    speeds.iter().try_for_each(|v| speed("baseline_entry_speeds_mps", *v))?;
-                }
-            }
-            inside("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
-            speed("min_mps", *min_mps)?;
-            match segment {
-                Observed::Whole => Ok(()),
-                Observed::First(l) => observes(*l),
-            }
-        }
-        FlowPolicy::MeanSpeed { offset_mps, gain_mps, segment_m, min_mps } => {
-            has_downstream()?;
-            inside("offset_mps", *offset_mps, &ranges::FLOW_OFFSET)?;
-            inside("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
-            speed("min_mps", *min_mps)?;
-            observes(*segment_m)
-        }
-    }
 }
 
 fn demand(demand: &Demand, vehicle: &VehicleParams, routes: usize) -> Check {

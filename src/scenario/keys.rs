@@ -5,8 +5,8 @@
 
 use super::ranges::{self, Range};
 use super::{
-    EntryRule, FeConditions, PositionFeedback, ReferenceLaw, Replan, SafetyRows, ShieldMode, Solver,
-    ViableParams,
+    EntryRule, FeConditions, LawKind, PassingOrder, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
+    ShieldMode, Solver, ViableParams,
 };
 
 /// A key, as messages and documents show it.
@@ -155,7 +155,7 @@ const fn without_default(
     Number { name, range, default: None, otherwise, meaning }
 }
 
-const fn other(
+pub(super) const fn other(
     name: &'static str,
     takes: &'static str,
     by_default: &'static str,
@@ -375,8 +375,10 @@ pub(in crate::scenario) static ENTRY: Choice<EntryRule> = Choice {
 };
 pub(in crate::scenario) static GATE: Keys = &[&ENTRY];
 
+pub(in crate::scenario) static LAW: Choice<LawKind> =
+    Choice { name: "law", words: LawKind::WORDS, meaning: "the law; a zone may have its own (`law`)" };
 pub(in crate::scenario) static CONTROL: Keys = &[
-    &other("law", "`ocbf`, `viable`", "`ocbf`", "the law; a zone may have its own (`law`)"),
+    &LAW,
     &REFERENCE,
     &REPLAN,
     &POSITION_FEEDBACK,
@@ -396,6 +398,7 @@ pub(in crate::scenario) static CONTROL: Keys = &[
         "0.25",
         "part of the path in which that mode may act",
     ),
+    &other("viable", "table", "see below", "parts and gains of the law `viable` ([control](control.md))"),
 ];
 
 // [[roads]]
@@ -453,6 +456,11 @@ pub(in crate::scenario) static RANDOM: Keys = &[
 ];
 
 // [[zones]]
+pub(in crate::scenario) static ORDER: Choice<PassingOrder> = Choice {
+    name: "order",
+    words: PassingOrder::WORDS,
+    meaning: "who passes a conflict point first ([zones](zones.md))",
+};
 pub(in crate::scenario) static ZONES: Keys = &[
     &other("name", "text", "required", "unique among the zones"),
     &other("flow", "table", "no flow control", "flow policy of the zone's exits"),
@@ -471,8 +479,8 @@ pub(in crate::scenario) static ZONES: Keys = &[
         "ways out; one that no source names leads out of the network",
     ),
     &other("crossings", "list", "none", "conflict areas of segments that no path shares"),
-    &other("order", "`fifo`, `per_point`", "`fifo`", "who passes a conflict point first ([zones](zones.md))"),
-    &other("law", "`ocbf`", "that of `[control]`", "law of the zone's built-in controllers"),
+    &ORDER,
+    &other("law", "as `law` of `[control]`", "that of `[control]`", "law of the zone's built-in controllers"),
 ];
 pub(in crate::scenario) static APPROACHES: Keys = &[
     &other("name", "text", "required", "unique in the zone"),
@@ -526,43 +534,6 @@ pub(in crate::scenario) static CROSSINGS: Keys = &[
         "table",
         "required",
         "segments, and where the area begins on each, m: `{ a = 12.5, b = 8 }`",
-    ),
-];
-
-// flow
-pub(in crate::scenario) static FLOW: Keys = &[
-    &other(
-        "policy",
-        "`none`, `fixed`, `feedback`, `mean_speed`",
-        "required",
-        "how the terminal speed v_m is set",
-    ),
-    &other("terminal_mps", "a speed from 0.01 m/s to `v_max_mps`", "required with `fixed`", "v_m"),
-    &other(
-        "baseline_mps",
-        "a speed, or `\"optimal\"`",
-        "required with `feedback`",
-        "v_m = baseline − gain · N; `optimal`: the mean optimal terminal speed over `baseline_entry_speeds_mps`",
-    ),
-    &other("baseline_entry_speeds_mps", "list of speeds", "10, 11, …, 20", "see `baseline_mps`"),
-    &other(
-        "gain_mps",
-        "0 to 1000 m/s per vehicle",
-        "required with `feedback` and `mean_speed`",
-        "of the number N of vehicles in the segment",
-    ),
-    &other(
-        "segment_m",
-        "a length in m",
-        "the whole zone; required with `mean_speed`",
-        "the first metres of the zone downstream, in which vehicles are counted",
-    ),
-    &other("min_mps", "a speed", "5", "v_m is not set lower, nor above `v_max_mps`"),
-    &other(
-        "offset_mps",
-        "-1000 to 1000 m/s",
-        "required with `mean_speed`",
-        "v_m = mean speed in the segment + offset − gain · N; free while it is empty",
     ),
 ];
 

@@ -6,29 +6,26 @@
 
 mod demand;
 mod document;
-mod error;
+pub(super) mod error;
 mod faults;
 mod overrides;
 mod plugins;
 mod routes;
 mod scope;
 mod sections;
-mod table;
+pub(super) mod table;
 mod topology;
 
 pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;
 
-use super::{EntryRule, LawKind, Network, Road, Scenario, embedded, keys, ranges};
+use super::ranges::MAX_TIME_S;
+use super::{EntryRule, LawKind, Network, Road, Scenario, embedded, flow, keys, ranges};
 use demand::{DemandReader, TraceBase};
-pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
-pub(super) use faults::{MAX_DELAY, MAX_ERROR};
-pub(super) use sections::MAX_KINDS;
 use std::collections::BTreeMap;
 use std::path::Path;
 use table::Table;
-pub(super) use topology::MAX_COUNT;
 
 /// The scenario that runs when none is named.
 pub const DEFAULT_SCENARIO: &str = "two-merges";
@@ -174,8 +171,8 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         table.only_declared(keys::ZONES)?;
     }
     let law = sections::law(control_table.as_ref(), LawKind::default())?;
-    let road_names = topology::unique_names(&road_tables, "road")?;
-    let zone_names = topology::unique_names(&zone_tables, "zone")?;
+    let road_names = table::unique_names(&road_tables, "road")?;
+    let zone_names = table::unique_names(&zone_tables, "zone")?;
     let step_m = vehicle.v_max_mps * dt_s;
     let mut topology = topology::read(
         &zone_tables,
@@ -243,10 +240,10 @@ fn flow_policies(
         for (index, exit) in zone.exits.iter_mut().enumerate() {
             let downstream = exit.to.map(|to| {
                 let (zone, longest_m) = &longest_m[to.zone as usize];
-                sections::Downstream { zone, longest_m: *longest_m }
+                flow::Downstream { zone, longest_m: *longest_m }
             });
             let table = own.get(index).filter(|exit| exit.get("flow").is_some()).unwrap_or(table);
-            exit.flow = sections::flow(table, downstream.as_ref(), vehicle)?;
+            exit.flow = flow::flow(table, downstream.as_ref(), vehicle)?;
         }
     }
     Ok(())

@@ -1,7 +1,7 @@
 //! The network: control zones, the exits and links between them, and the entry roads.
 
 use super::demand::Demand;
-use super::params::FlowPolicy;
+use super::flow::FlowPolicy;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -125,6 +125,12 @@ pub enum PassingOrder {
     PerPoint,
 }
 
+impl PassingOrder {
+    /// The words for them, the default first.
+    pub(super) const WORDS: &'static [(&'static str, PassingOrder)] =
+        &[("fifo", PassingOrder::Fifo), ("per_point", PassingOrder::PerPoint)];
+}
+
 /// A law of the built-in controllers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -147,6 +153,12 @@ pub enum EntryRule {
     Viable,
     /// Once it can stop behind it, whatever that one does.
     RoomToStop,
+}
+
+impl LawKind {
+    /// The words for them, the default first.
+    pub(super) const WORDS: &'static [(&'static str, LawKind)] =
+        &[("ocbf", LawKind::Ocbf), ("viable", LawKind::Viable)];
 }
 
 /// An entry road.

@@ -30,7 +30,7 @@ const PARTS: [(&str, &str, Keys); 21] = [
     (
         "`flow` of a zone or exit",
         "`feedback` and `mean_speed` observe the zone downstream and need one.",
-        FLOW,
+        crate::scenario::flow::KEYS,
     ),
     ("`[[controllers]]`", "", CONTROLLERS),
     (

@@ -3,6 +3,7 @@
 use super::error::{Place, ScenarioError, nearest};
 use super::table::{Field, Table};
 use crate::scenario::keys;
+use crate::scenario::ranges::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use crate::scenario::{
     Arrival, Demand, Poisson, RatePeriod, Route, SpeedDistribution, VehicleParams, ranges,
 };
@@ -10,10 +11,6 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::rc::Rc;
 
-/// Instants above this are refused: step numbers times nanoseconds stay far within 64 bits.
-pub(in crate::scenario) const MAX_TIME_S: f64 = 1e9;
-/// 10 vehicles per second: no lane carries it, and it bounds the work per simulated second.
-pub(in crate::scenario) const MAX_RATE_PER_HOUR: f64 = 36_000.0;
 const HEADER: &str = "time_s,road,speed_mps";
 /// A trace may say which of its road's routes a vehicle takes.
 const HEADER_WITH_ROUTES: &str = "time_s,road,speed_mps,route";

@@ -1,8 +1,8 @@
 //! `roads.*.routes`: which ways the vehicles of a road may take.
 
 use super::error::ScenarioError;
-use super::table::Table;
-use super::topology::unique_names;
+use super::table::{Table, unique_names};
+
 use crate::scenario::{Route, Zone, keys};
 
 /// Reads the routes of a road that leads to `(zone, entrance)`; none when it does not name any.

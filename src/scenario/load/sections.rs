@@ -1,14 +1,11 @@
-//! Vehicle limits, objective, control law and flow policies.
+//! Vehicle limits, objective and control law.
 
 use super::error::ScenarioError;
-use super::table::Table;
+use super::table::{Table, unique_names};
+use crate::scenario::ranges::MAX_KINDS;
 use crate::scenario::{
-    Baseline, ControlParams, EntryRule, FlowPolicy, LawKind, Observed, VehicleKind, VehicleParams,
-    ViableParams, keys, ranges,
+    ControlParams, EntryRule, LawKind, VehicleKind, VehicleParams, ViableParams, keys, ranges,
 };
-
-/// No more kinds of vehicles than this.
-pub(in crate::scenario) const MAX_KINDS: usize = 64;
 
 /// `[vehicle]`, or the defaults.
 pub(super) fn vehicle(table: Option<&Table<'_>>) -> Result<VehicleParams, ScenarioError> {
@@ -48,7 +45,7 @@ pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<Veh
         return Ok(vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: *vehicle }]);
     }
     let tables = root.tables("fleet", "a list of kinds of vehicles, each with a name")?;
-    let names = super::topology::unique_names(&tables, "kind of vehicle")?;
+    let names = unique_names(&tables, "kind of vehicle")?;
     let mut kinds = Vec::with_capacity(tables.len());
     for (t, name) in tables.iter().zip(names) {
         t.only_declared(keys::FLEET)?;
@@ -71,7 +68,7 @@ pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<Veh
 pub(super) fn law(table: Option<&Table<'_>>, default: LawKind) -> Result<LawKind, ScenarioError> {
     match table.and_then(|t| t.get("law")) {
         None => Ok(default),
-        Some(field) => field.choice(&[("ocbf", LawKind::Ocbf), ("viable", LawKind::Viable)]),
+        Some(field) => field.choice(keys::LAW.words),
     }
 }
 
@@ -171,118 +168,4 @@ fn viable(t: &Table<'_>) -> Result<ViableParams, ScenarioError> {
         buffer_s: t.number_or(&keys::BUFFER_TIME, default.buffer_s)?,
         passage_weight: t.number_or(&keys::PASSAGE_WEIGHT, default.passage_weight)?,
     })
-}
-
-/// What a zone's policy can observe: the lengths of the approaches of the zone downstream, if there is one.
-pub(super) struct Downstream<'a> {
-    pub(super) zone: &'a str,
-    pub(super) longest_m: f64,
-}
-
-/// `zones.*.flow`, or no flow control.
-pub(super) fn flow(
-    zone: &Table<'_>,
-    downstream: Option<&Downstream<'_>>,
-    vehicle: &VehicleParams,
-) -> Result<FlowPolicy, ScenarioError> {
-    #[derive(Clone, Copy, PartialEq)]
-    enum Kind {
-        None,
-        Fixed,
-        Feedback,
-        MeanSpeed,
-    }
-    let Some(field) = zone.get("flow") else { return Ok(FlowPolicy::None) };
-    const POLICY: &str = "a table such as {policy = \"fixed\", terminal_mps = 15}";
-    let mut t = field.table(POLICY)?;
-    let all = keys::names(keys::FLOW);
-    // Without a policy the other keys cannot be judged; a misspelt "policy" is still found here.
-    t.only(&all)?;
-    let policy = t.need("policy", "\"none\", \"fixed\", \"feedback\" or \"mean_speed\"")?;
-    let kind = policy.choice(&[
-        ("none", Kind::None),
-        ("fixed", Kind::Fixed),
-        ("feedback", Kind::Feedback),
-        ("mean_speed", Kind::MeanSpeed),
-    ])?;
-    let known: &[&str] = match kind {
-        Kind::None => &["policy"],
-        Kind::Fixed => &["policy", "terminal_mps"],
-        Kind::Feedback => {
-            &["policy", "baseline_mps", "baseline_entry_speeds_mps", "gain_mps", "segment_m", "min_mps"]
-        }
-        Kind::MeanSpeed => &["policy", "offset_mps", "gain_mps", "segment_m", "min_mps"],
-    };
-    t.only_or_stale(known, if policy.is_set() { &all[..] } else { &[] })?;
-    t.blame(&policy);
-
-    let v_max = vehicle.v_max_mps;
-    let (is_speed, speed) = flow_speed(v_max);
-    if kind == Kind::None {
-        return Ok(FlowPolicy::None);
-    }
-    if kind == Kind::Fixed {
-        return Ok(FlowPolicy::Fixed { terminal_mps: t.f64("terminal_mps", is_speed, &speed)? });
-    }
-    let Some(downstream) = downstream else {
-        let problem = "the zone's exit leads out of the network, there is nothing to observe".to_owned();
-        return Err(policy.bad_because(Some(problem), "\"none\" or \"fixed\""));
-    };
-    let longest = downstream.longest_m;
-    let segment_ok = |l| l > 0.0 && l <= longest;
-    let segment = format!(
-        "a length with 0 < l <= {longest} m, the longest approach of the zone downstream, {}",
-        downstream.zone
-    );
-    let gain_mps = t.within("gain_mps", &ranges::FLOW_GAIN)?;
-    let min_mps = t.f64_or("min_mps", 5.0, is_speed, &speed)?;
-    if kind == Kind::MeanSpeed {
-        return Ok(FlowPolicy::MeanSpeed {
-            offset_mps: t.within("offset_mps", &ranges::FLOW_OFFSET)?,
-            gain_mps,
-            segment_m: t.f64("segment_m", segment_ok, &segment)?,
-            min_mps,
-        });
-    }
-    let segment = match t.get("segment_m") {
-        None => Observed::Whole,
-        Some(field) => Observed::First(field.f64(segment_ok, &segment)?),
-    };
-    Ok(FlowPolicy::Feedback { baseline: baseline(&t, v_max)?, gain_mps, segment, min_mps })
-}
-
-/// Whether a speed is one that vehicles may be told to leave at, and what is expected.
-fn flow_speed(v_max: f64) -> (impl Fn(f64) -> bool + Copy, String) {
-    let expected = format!("{} and <= v_max_mps = {v_max}", ranges::FLOW_SPEED);
-    (move |v| ranges::FLOW_SPEED.contains(v) && v <= v_max, expected)
-}
-
-/// `baseline_mps`: a speed, or "optimal" with the entry speeds to take the mean over.
-fn baseline(t: &Table<'_>, v_max: f64) -> Result<Baseline, ScenarioError> {
-    let (is_speed, speed) = flow_speed(v_max);
-    let expected = format!("{speed}, or \"optimal\"");
-    let field = t.need("baseline_mps", &expected)?;
-    let samples = t.get("baseline_entry_speeds_mps");
-    if field.str("").is_ok_and(|word| word == "optimal") {
-        let list = format!("a list of speeds, each {speed}");
-        let speeds: Vec<f64> = match samples {
-            Some(samples) => {
-                let items = samples.items(&list)?;
-                items.iter().map(|item| item.f64(is_speed, &speed)).collect::<Result<_, _>>()?
-            }
-            None => (10..=20).map(f64::from).filter(|&v| v <= v_max).collect(),
-        };
-        if speeds.is_empty() {
-            return Err(t.missing("baseline_entry_speeds_mps", &format!("{list} (the defaults exceed it)")));
-        }
-        return Ok(Baseline::Optimal(speeds));
-    }
-    let given = field.f64(is_speed, &expected)?;
-    match samples {
-        // Left over from the file's "optimal" when a --set gives the speed.
-        Some(samples) if samples.is_set() || !field.is_set() => {
-            Err(samples.bad_because(Some(format!("baseline_mps is {given}")), "it only with \"optimal\""))
-        }
-        _ => Ok(Baseline::Given(given)),
-    }
 }

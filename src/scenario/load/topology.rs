@@ -2,14 +2,11 @@
 
 use super::error::{ScenarioError, nearest};
 use super::sections;
-use super::table::{Field, Table};
+use super::table::{Field, Table, unique_names};
 use crate::scenario::network::entrance_without_way_out;
 use crate::scenario::{
-    Crossing, Downstream, Exit, FlowPolicy, LawKind, PassingOrder, Path, Segment, Source, Zone, keys, ranges,
+    Crossing, Downstream, Exit, FlowPolicy, LawKind, Path, Segment, Source, Zone, keys, ranges,
 };
-
-/// No more zones, roads, or paths of a zone than this: frames carry their indices in 16 bits.
-pub(in crate::scenario) const MAX_COUNT: usize = 65_535;
 
 /// Name of the one exit of a zone in the short form.
 const ONLY_EXIT: &str = "exit";
@@ -22,26 +19,6 @@ pub(super) struct Topology {
     pub(super) declared: Vec<usize>,
     /// Zone and entrance each road leads to.
     pub(super) road_ends: Vec<(u32, u32)>,
-}
-
-/// Reads the names of an array of tables, which must be unique.
-pub(super) fn unique_names<'a>(tables: &[Table<'a>], what: &str) -> Result<Vec<&'a str>, ScenarioError> {
-    let mut seen = std::collections::BTreeSet::new();
-    let mut names = Vec::with_capacity(tables.len());
-    for table in tables {
-        let name = table.name()?;
-        if !seen.insert(name) {
-            let expected = format!("a name no other {what} has");
-            return Err(table.need("name", &expected)?.bad_because(Some("used twice".into()), &expected));
-        }
-        names.push(name);
-    }
-    if names.len() > MAX_COUNT {
-        let table = &tables[MAX_COUNT];
-        let expected = format!("at most {MAX_COUNT} {what} entries");
-        return Err(table.need("name", &expected)?.bad_because(Some("too many".into()), &expected));
-    }
-    Ok(names)
 }
 
 /// Reads all zones; `step_m` is the farthest a vehicle may go in one step.
@@ -127,8 +104,7 @@ struct Shape<'a> {
 }
 
 fn zone<'a>(table: &Table<'a>, name: &str, step_m: f64, law: LawKind) -> Result<Shape<'a>, ScenarioError> {
-    let order = table
-        .choice_or_first("order", &[("fifo", PassingOrder::Fifo), ("per_point", PassingOrder::PerPoint)])?;
+    let order = table.chosen(&keys::ORDER)?;
     let zone = Zone {
         name: name.to_owned(),
         segments: Vec::new(),
