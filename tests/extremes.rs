@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use std::sync::Arc;
 
-/// What README.md says of a key, and a setting of it with `{}` for the value.
+/// What docs/scenario.md says of a key, and a setting of it with `{}` for the value.
 struct Number {
     key: &'static str,
     range: Option<(&'static str, &'static str)>,
@@ -177,15 +177,15 @@ fn every_number_far_beyond_its_range_is_refused_or_can_be_run() {
 
 #[test]
 fn the_ends_of_every_range_can_be_run_and_what_is_beyond_them_is_refused() {
-    let readme = include_str!("../README.md");
+    let document = include_str!("../docs/scenario.md");
     for number in &NUMBERS {
         let Some((least, greatest)) = number.range else { continue };
         let words = format!("{least} to {greatest}");
-        let documented = readme.lines().any(|line| {
+        let documented = document.lines().any(|line| {
             let key = number.key.rsplit('.').next().unwrap();
             line.starts_with('|') && line.contains(&format!("{key}`")) && line.contains(&words)
         });
-        assert!(documented, "README.md does not say that {} is {words}", number.key);
+        assert!(documented, "docs/scenario.md does not say that {} is {words}", number.key);
         let values = [least, greatest].map(|text| text.parse::<f64>().unwrap());
         for (value, beyond) in values.into_iter().zip([-1.0, 1.0]) {
             // Just outside, relative to the size; 0 has only one side that matters.

@@ -4,8 +4,11 @@
 
 mod common;
 
-use common::{Site, hash};
+use common::{Site, begin, hash, is_alive, part, send, wait_until};
+use control_zones::record::{Reader, Writer};
+use rustix::process::Signal;
 use serde_json::Value;
+use std::path::Path;
 use std::sync::Mutex;
 
 /// State hashes of in-process runs, by scenario, for the seeds 1 to 3.
@@ -111,7 +114,9 @@ fn check_keys(summary: &Value, scenario: &str, seed: u64) {
         ] {
             assert!(zone[key].is_f64(), "{key}: {zone}");
         }
-        total += zone["mean_objective"].as_f64().unwrap();
+        // Waiting outside is time, too.
+        let wait_s = zone["mean_wait_s"].as_f64().unwrap();
+        total += zone["mean_objective"].as_f64().unwrap() + summary["beta"].as_f64().unwrap() * wait_s;
     }
     assert!((summary["total_objective"].as_f64().unwrap() - total).abs() < 1e-9, "{summary}");
 }
@@ -181,4 +186,108 @@ fn lane_drop() {
 #[test]
 fn grid() {
     check("grid-3x3");
+}
+
+/// A run long enough to be disturbed in the middle of: the scenario's demand for half an hour.
+fn long(scenario: &str) -> Vec<String> {
+    let text = std::fs::read_to_string(format!("{}/scenarios/{scenario}.toml", env!("CARGO_MANIFEST_DIR")));
+    let table: toml::Table = text.unwrap().parse().unwrap();
+    let mut arguments = vec![scenario.to_owned(), "--set".to_owned(), "end.time_s=1800".to_owned()];
+    for road in table["roads"].as_array().unwrap() {
+        let (name, rates) = (road["name"].as_str().unwrap(), &road["demand"]["rates"]);
+        let rate = rates[0]["vehicles_per_hour"].as_float().unwrap();
+        let set = format!(
+            "roads.{name}.demand.rates=[{{until_s=1800.0,vehicles_per_hour={:?}}}]",
+            // The grid is slow enough as it is.
+            if scenario == "grid-3x3" { rate / 2.0 } else { rate }
+        );
+        arguments.extend(["--set".to_owned(), set]);
+    }
+    arguments
+}
+
+fn steps_in(file: &Path) -> u64 {
+    Reader::open(file).map_or(0, |reader| reader.steps().map_while(Result::ok).count() as u64)
+}
+
+fn cz(site: &Site, arguments: &[&str]) -> String {
+    let output = site.command("cz").args(arguments).output().unwrap();
+    assert!(output.status.success(), "{arguments:?}: {output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Recorded and replayed, cut off and resumed, branched without a change, and with the controller, the coordinator and
+/// the world killed in the middle.
+fn check_disturbed(scenario: &str) {
+    let _alone = PROCESSES.lock();
+    let (site, folder) = (Site::new("w"), tempfile::tempdir().unwrap());
+    let path = |name: &str| folder.path().join(name);
+    let arguments = long(scenario);
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    let (whole, cut, killed) = (path("whole.czlog"), path("cut.czlog"), path("killed.czlog"));
+    let [whole_path, cut_path, killed_path] = [&whole, &cut, &killed].map(|p| p.to_str().unwrap());
+    let expected = hash(&site.summary(&[&arguments[..], &["--in-process"]].concat()));
+
+    // Processes that are killed are replaced, and it is recorded as if nothing had been.
+    let json = ["--json", "-", "--record", whole_path];
+    let (supervisor, parts) = begin(&site, &[&arguments[..], &json].concat(), 3);
+    for (victim, after) in [("ctrl", 500), ("coord", 1500)] {
+        wait_until("the run to be under way", || steps_in(&whole) > after);
+        let id = part(&parts, victim);
+        assert!(is_alive(id), "{scenario}: over before {victim} was killed");
+        send(id, Signal::KILL);
+    }
+    let summary = supervisor.ended().json();
+    assert_eq!(hash(&summary), expected, "{scenario}: controller and coordinator killed");
+    assert_eq!(summary["replacements"].as_array().unwrap().len(), 2, "{scenario}: {summary}");
+    assert!(cz(&site, &["replay", whole_path]).contains(&expected), "{scenario}: replay");
+
+    // Cut off in the middle of the file.
+    let reader = Reader::open(&whole).unwrap();
+    let steps: Vec<_> = reader.steps().map(Result::unwrap).collect();
+    let mut writer = Writer::new(std::fs::File::create(&cut).unwrap(), reader.metadata()).unwrap();
+    steps[..steps.len() / 3].iter().for_each(|step| writer.append(&step.encode()).unwrap());
+    drop(writer);
+    let resumed: Value = serde_json::from_str(&cz(&site, &["resume", cut_path, "--json", "-"])).unwrap();
+    assert_eq!(hash(&resumed), expected, "{scenario}: resumed");
+
+    // Branched with a change that is none.
+    let at = (steps.len() / 2).to_string();
+    let same = ["branch", whole_path, "--at", &at, "--set", "control.k_merge_per_s=1.0", "--json"];
+    let both: Value = serde_json::from_str(&cz(&site, &same)).unwrap();
+    for side in ["as_recorded", "branched"] {
+        let found = format!("{:016x}", both[side]["state_hash"].as_u64().unwrap());
+        assert_eq!(found, expected, "{scenario}: {side}");
+    }
+
+    // The world killed, and the run resumed.
+    let (supervisor, parts) = begin(&site, &[&arguments[..], &["--record", killed_path]].concat(), 3);
+    wait_until("the run to be under way", || steps_in(&killed) > 800);
+    send(part(&parts, "world"), Signal::KILL);
+    assert!(!supervisor.ended().status.success(), "{scenario}: over before the world was killed");
+    wait_until("the others to end", || parts.iter().all(|(_, id)| !is_alive(*id)));
+    let resumed: Value = serde_json::from_str(&cz(&site, &["resume", killed_path, "--json", "-"])).unwrap();
+    assert_eq!(hash(&resumed), expected, "{scenario}: resumed after the world was killed");
+    cz(&site, &["clean"]);
+    site.assert_clean();
+}
+
+#[test]
+fn a_disturbed_intersection() {
+    check_disturbed("intersection");
+}
+
+#[test]
+fn a_disturbed_roundabout() {
+    check_disturbed("roundabout");
+}
+
+#[test]
+fn a_disturbed_lane_drop() {
+    check_disturbed("lane-drop");
+}
+
+#[test]
+fn a_disturbed_grid() {
+    check_disturbed("grid-3x3");
 }

@@ -110,7 +110,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "\"dt\\ns\" = 0.1",
-        "s.toml:3: dt\\ns = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, gate, coordination, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
+        "s.toml:3: dt\\ns = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, coordination, gate, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "[control]",
@@ -136,7 +136,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "dt_s = 0.1",
         "dts = 0.1",
-        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, gate, coordination, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
+        "s.toml:3: dts = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, coordination, gate, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "dt_s = 0.1",
@@ -611,11 +611,11 @@ const SET_CASES: &[(&str, &str)] = &[
     ),
     (
         "dt=0.1",
-        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, gate, coordination, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
+        "--set dt=0.1: dt = 0.1: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, coordination, gate, shield, fleet, roads, zones, controllers, faults; did you mean dt_s?",
     ),
     (
         "network.size=3",
-        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, gate, coordination, shield, fleet, roads, zones, controllers, faults",
+        "--set network.size=3: network = {...}: unknown key; expected one of name, seed, dt_s, end, vehicle, objective, control, coordination, gate, shield, fleet, roads, zones, controllers, faults",
     ),
     (
         "control.replan=from_stat",

@@ -1,21 +1,17 @@
 //! `cz bench`: measurements.
 
 use super::args::{
-    BenchArgs, BenchKind, ConductArgs, PeerArgs, Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs,
+    BenchArgs, BenchKind, ConductArgs, PeerArgs, Restart, ScenarioArgs, ShareArgs, SideBySide, TimingArgs,
 };
-use super::record::Recording;
-use super::run::own_name;
-use super::supervise::{self, Plan};
+use super::measured::{WAIT, align, run_as, scenario_of, start_peer, table};
 use super::{AppError, print};
 use crate::bench::{
-    self, BenchError, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport, SolverReport, Sumo,
+    self, BenchError, Family, LatencyOptions, LatencyReport, PeerKind, ScaleOptions, ScaleReport,
+    SolverReport, Sumo,
 };
-use crate::process::{Outcome, Percentiles, Placement, StopFlag, WaitMode, new_run_id, run_in_process};
-use comfy_table::{CellAlignment, Table, presets};
+use crate::process::{Outcome, Percentiles, StopFlag, WaitMode, run_in_process};
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
-use std::time::Duration;
 
 impl From<BenchError> for AppError {
     fn from(error: BenchError) -> AppError {
@@ -38,7 +34,8 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
             deliver(args.json.as_deref(), &report, &solver_table(&report))
         }
         BenchKind::Scale(args) => {
-            let report = scale(args.measure.quick, args.with_sumo.then_some(args.sumo_up_to))?;
+            let family = if args.grids { Family::Grids } else { Family::Corridors };
+            let report = scale(family, args.measure.quick, args.with_sumo.then_some(args.sumo_up_to))?;
             deliver(args.measure.json.as_deref(), &report, &scale_table(&report))
         }
         BenchKind::Wait(args) => {
@@ -60,19 +57,6 @@ fn deliver(json: Option<&Path>, report: &impl serde::Serialize, table: &str) -> 
     print(table)
 }
 
-/// The default scenario with the whole trace: ten times as many steps as `cz run` takes.
-pub(super) fn scenario_of(quick: bool) -> ScenarioArgs {
-    let set = if quick { vec![] } else { vec!["end.vehicles=600".to_owned()] };
-    ScenarioArgs { scenario: None, seed: Some(1), set, corridors: None }
-}
-
-pub(super) const WAIT: WaitArgs = WaitArgs {
-    attach_timeout: Duration::from_secs(30),
-    peer_timeout: Duration::from_secs(30),
-    pin: Placement::Auto,
-    rt: false,
-};
-
 fn run_processes(
     scenario: &ScenarioArgs,
     controllers: u32,
@@ -83,40 +67,6 @@ fn run_processes(
     let (wait_mode, timing) = (WaitMode::default(), TimingArgs::default());
     let conduct = ConductArgs { wait: WAIT, wait_mode, restart, timing, record_lag: None };
     run_as(scenario, share, conduct, record)
-}
-
-/// Runs a scenario in processes of its own.
-pub(super) fn run_as(
-    scenario: &ScenarioArgs,
-    share: ShareArgs,
-    conduct: ConductArgs,
-    record: Option<&Path>,
-) -> Result<Outcome, String> {
-    let plan = Plan {
-        run: own_name(),
-        scenario,
-        share,
-        plugins: &[],
-        pool: share.ctrl_procs,
-        conduct,
-        run_id: new_run_id(),
-        resume: None,
-    };
-    let words = |e: AppError| e.to_string();
-    let recording = match record {
-        Some(path) => {
-            let loaded = scenario.load().map_err(|e| e.to_string())?;
-            Some(Recording::start(path, scenario, &loaded, plan.share, plan.run_id).map_err(words)?)
-        }
-        None => None,
-    };
-    let mut outcome = None;
-    supervise::conduct(&plan, recording, None, |result| {
-        outcome = Some(result);
-        Ok(())
-    })
-    .map_err(words)?;
-    Ok(outcome.expect("a run that has not failed has results"))
 }
 
 fn latency(quick: bool) -> Result<LatencyReport, AppError> {
@@ -136,13 +86,6 @@ fn latency(quick: bool) -> Result<LatencyReport, AppError> {
         },
     };
     Ok(bench::latency(&options)?)
-}
-
-/// Starts this program as the other process of a measurement.
-pub(super) fn start_peer(scenario: &ScenarioArgs, kind: &[String]) -> std::io::Result<Child> {
-    let mut command = Command::new(std::env::current_exe()?);
-    command.args(["bench", "peer"]).args(scenario.to_flags()).args(kind);
-    command.stdin(Stdio::null()).spawn()
 }
 
 fn peer(args: &PeerArgs) -> Result<(), AppError> {
@@ -168,7 +111,7 @@ fn peer(args: &PeerArgs) -> Result<(), AppError> {
 /// Vehicles from which on SUMO's clock is fine enough.
 const SUMO_FROM: usize = 1_000;
 
-fn scale(quick: bool, sumo_up_to: Option<usize>) -> Result<ScaleReport, AppError> {
+fn scale(family: Family, quick: bool, sumo_up_to: Option<usize>) -> Result<ScaleReport, AppError> {
     // First, so that a missing package is said before minutes have passed.
     let sumo = match sumo_up_to {
         Some(most) => Some((Sumo::find()?, SUMO_FROM..=most)),
@@ -176,7 +119,8 @@ fn scale(quick: bool, sumo_up_to: Option<usize>) -> Result<ScaleReport, AppError
     };
     let sizes = if quick { vec![100, 1_000] } else { vec![100, 1_000, 10_000, 100_000] };
     let run = |size: usize, controllers: u32| {
-        let arguments = ScenarioArgs { scenario: None, seed: None, set: vec![], corridors: Some(size) };
+        let side_by_side = Some(SideBySide { family, vehicles: size });
+        let arguments = ScenarioArgs { scenario: None, seed: None, set: vec![], side_by_side };
         if controllers == 0 {
             let scenario = Arc::new(arguments.load().map_err(|e| e.to_string())?);
             return run_in_process(&scenario, 1, 1, &StopFlag::none(), |_| {}).map_err(|e| e.to_string());
@@ -186,19 +130,6 @@ fn scale(quick: bool, sumo_up_to: Option<usize>) -> Result<ScaleReport, AppError
     Ok(bench::scale(&ScaleOptions { sizes, run: &run, sumo }, |point| {
         eprintln!("{} vehicles, {} controllers: {} ns", point.vehicles, point.controllers, point.step_ns);
     })?)
-}
-
-pub(super) fn table(header: &[&str]) -> Table {
-    let mut table = Table::new();
-    table.load_style(presets::UTF8_HORIZONTAL_ONLY);
-    table.set_header(header.iter().copied());
-    table
-}
-
-pub(super) fn align(table: &mut Table) {
-    for column in table.column_iter_mut().skip(1) {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
 }
 
 fn latency_table(r: &LatencyReport) -> String {

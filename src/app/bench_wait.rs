@@ -2,7 +2,7 @@
 
 use super::AppError;
 use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs, WaitBenchArgs};
-use super::bench::{WAIT, align, run_as, scenario_of, start_peer, table as new_table};
+use super::measured::{WAIT, align, run_as, scenario_of, start_peer, table as new_table};
 use crate::bench::{self, BenchError, NINE, Side, THREE, Timed, WaitingOptions, WaitingReport};
 use crate::process::{Placement, WaitMode, check_cores};
 use std::path::Path;

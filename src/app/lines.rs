@@ -1,6 +1,6 @@
 //! What the processes of a run tell their supervisor, a line each.
 
-use super::run::Position;
+use super::progress::Position;
 use crate::lockstep::RefusedFrames;
 use crate::process::{Outcome, Settled};
 use crate::world::World;

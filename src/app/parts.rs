@@ -8,10 +8,11 @@ use super::say::say;
 use super::{AppError, record, report};
 use crate::lockstep::RefusedFrames;
 use crate::process::{
-    Departure, Joining, Observation, Settled, Settling, StopFlag, WorldOptions, first_missing_step,
-    new_run_id, run_controller, run_coordinator, run_world,
+    Conduct, Departure, Joining, Observation, ProcessError, Settled, Settling, StopFlag, WorldOptions,
+    first_missing_step, new_run_id, run_controller, run_coordinator, run_world,
 };
 use crate::scenario::scenario_hash;
+use crate::transport::iox::RunName;
 use crate::world::World;
 use ipc_schemas::Role;
 use std::io::Write;
@@ -107,17 +108,24 @@ fn leave(departure: Departure, options: &WorldOptions, stop: &StopFlag) {
 }
 
 pub(super) fn coordinator(args: &PartArgs) -> Result<(), AppError> {
-    let (joining, stop) = prepare(args, Role::Coordinator)?;
-    let report = report_to(args.supervised, &args.wait);
-    let settling = settling(&args.wait, &*report);
-    Ok(run_coordinator(&args.run, joining, args.wait.peer_timeout, &settling, &refused_to(args), &stop)?)
+    part(args, Role::Coordinator, run_coordinator)
 }
 
 pub(super) fn controller(args: &PartArgs) -> Result<(), AppError> {
-    let (joining, stop) = prepare(args, Role::Controller)?;
+    part(args, Role::Controller, run_controller)
+}
+
+fn part(
+    args: &PartArgs,
+    role: Role,
+    run: impl FnOnce(&RunName, Conduct<'_>) -> Result<(), ProcessError>,
+) -> Result<(), AppError> {
+    let (joining, stop) = prepare(args, role)?;
     let report = report_to(args.supervised, &args.wait);
-    let settling = settling(&args.wait, &*report);
-    Ok(run_controller(&args.run, joining, args.wait.peer_timeout, &settling, &refused_to(args), &stop)?)
+    let (settling, refused) = (settling(&args.wait, &*report), refused_to(args));
+    let peer_timeout = args.wait.peer_timeout;
+    let conduct = Conduct { joining, peer_timeout, settling: &settling, refused: &refused, stop: &stop };
+    Ok(run(&args.run, conduct)?)
 }
 
 fn settling<'a>(wait: &WaitArgs, report: &'a dyn Fn(&Settled)) -> Settling<'a> {

@@ -2,8 +2,7 @@
 
 use super::args::PluginCommand;
 use super::{AppError, print};
-use crate::process::plugin_check::{CONTROLLER, Report, Rule, check};
-use crate::scenario::{Override, load};
+use crate::process::plugin_check::{Report, Rule, check, scenario};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -19,9 +18,7 @@ fn run(deadline_ms: f64, json: bool, command: &[String]) -> Result<(), AppError>
         let expected = "a time > 0 and <= 1e6 ms";
         return Err(AppError::Usage(format!("--deadline-ms {deadline_ms}: expected {expected}")));
     }
-    let sets = [format!("controllers=[{{name=\"{CONTROLLER}\", zones=[\"merge-2\"]}}]")];
-    let sets = sets.iter().map(|s| s.parse()).collect::<Result<Vec<Override>, _>>()?;
-    let scenario = Arc::new(load(None, &sets, None)?);
+    let scenario = Arc::new(scenario()?);
     let report = check(&scenario, command, Duration::from_secs_f64(deadline_ms * 1e-3))?;
     if json {
         print(&(serde_json::to_string_pretty(&report).expect("a report has string keys only") + "\n"))?;

@@ -1,8 +1,7 @@
 //! `cz run --record`, `cz verify`, `cz replay`.
 
 use super::args::{ReplayArgs, ScenarioArgs, ShareArgs, VerifyArgs};
-use super::say::say;
-use super::show::number;
+use super::say::{number, say};
 use super::{AppError, print};
 use crate::process::RecordLag;
 use crate::record::{
@@ -47,7 +46,7 @@ impl Recording {
         run_id: u64,
     ) -> Result<Recording, AppError> {
         // A generated network has no text.
-        let text = match arguments.corridors {
+        let text = match arguments.side_by_side {
             Some(_) => String::new(),
             None => text_of(arguments.scenario.as_deref())?,
         };

@@ -1,6 +1,6 @@
 //! The summary of a run: as JSON, and as a table for people.
 
-use super::show::number;
+use super::say::number;
 use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
 use crate::process::{LatencyBin, LatencyUs, Outcome, Punctuality, Replacement, Settled};

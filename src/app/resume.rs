@@ -1,9 +1,10 @@
 //! `cz resume`: an interrupted run goes on. `cz branch`: another future of the same past.
 
 use super::args::{BranchArgs, ResumeArgs, ScenarioArgs};
+use super::progress::Bar;
 use super::record::Recording;
 use super::report::{Summary, Transport};
-use super::run::{Bar, own_name};
+use super::run::own_name;
 use super::say::say;
 use super::supervise::{Plan, conduct};
 use super::{AppError, print, record, report};

@@ -1,6 +1,7 @@
 //! `cz run`: a whole run, in this process or in several.
 
 use super::args::{RunArgs, ScenarioArgs};
+use super::progress::{Bar, Position};
 use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::supervise::{Plan, conduct};
@@ -10,7 +11,6 @@ use crate::process::{StopFlag, WaitMode, check_cores, new_run_id, run_in_process
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::World;
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::sync::Arc;
 
 pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
@@ -96,48 +96,4 @@ fn run_here(
 /// A run name nobody else has.
 pub(super) fn own_name() -> RunName {
     format!("cz-{}", std::process::id()).parse().expect("letters, a dash and digits are a run name")
-}
-
-/// How far a run is.
-#[derive(Clone, Copy, Debug, serde::Serialize, serde::Deserialize)]
-pub(super) struct Position {
-    pub step: u64,
-    pub arrived: u32,
-    pub departed: u32,
-}
-
-impl Position {
-    pub fn of(world: &World) -> Position {
-        let departed = world.departed();
-        Position { step: world.step(), arrived: world.arrived(), departed }
-    }
-}
-
-/// The progress bar: vehicles when their number is known, simulated time otherwise.
-pub(super) struct Bar {
-    bar: ProgressBar,
-    by_vehicle: bool,
-    dt_s: f64,
-}
-
-impl Bar {
-    pub fn new(scenario: &Scenario) -> Bar {
-        let length = scenario.max_vehicles.map_or(scenario.max_time_s as u64, u64::from);
-        // Hidden by itself when stderr is no terminal.
-        let bar = ProgressBar::with_draw_target(Some(length), ProgressDrawTarget::stderr());
-        let style = "{msg} [{wide_bar}] {percent}% {eta}";
-        bar.set_style(ProgressStyle::with_template(style).expect("the template is well formed"));
-        Bar { bar, by_vehicle: scenario.max_vehicles.is_some(), dt_s: scenario.dt_s() }
-    }
-
-    pub fn show(&self, position: Position) {
-        let time_s = position.step as f64 * self.dt_s;
-        self.bar.set_position(if self.by_vehicle { u64::from(position.departed) } else { time_s as u64 });
-        let inside = position.arrived - position.departed;
-        self.bar.set_message(format!("step {}, {time_s:.0} s, {inside} vehicles", position.step));
-    }
-
-    pub fn finish(&self) {
-        self.bar.finish_and_clear();
-    }
 }

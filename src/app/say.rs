@@ -11,6 +11,11 @@ pub(super) fn say(line: impl Display) {
     let _ = std::io::stderr().lock().write_all(line.as_bytes());
 }
 
+/// A number of things in words.
+pub(super) fn number(count: u64, what: &str) -> String {
+    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
+}
+
 /// Lines that may wait to be taken.
 const WAITING: usize = 4096;
 /// How long whoever reads may take for what is left at the end.

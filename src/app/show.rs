@@ -2,6 +2,7 @@
 
 use super::args::ShowArgs;
 use super::record::{bytes, open, ranges};
+use super::say::number;
 use super::{AppError, print};
 use crate::record::words::{mode, place, verdict, zone_name};
 use crate::record::{Damage, Flaw, Reader, Source, Step, steps_in};
@@ -72,11 +73,6 @@ impl NoStep {
             NoStep::Damaged(damage) => format!("{path}: damaged at {damage}"),
         })
     }
-}
-
-/// A number of things in words.
-pub(super) fn number(count: u64, what: &str) -> String {
-    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
 }
 
 fn pretty(value: &Value) -> String {

@@ -1,7 +1,8 @@
 //! `cz bench latency`: one step, next to the floor beneath it and to what one would write instead.
 
+use super::PATIENCE;
 use super::machine::Machine;
-use super::peer::{PATIENCE, receive};
+use super::peer::receive;
 use super::shared_word::SharedWords;
 use super::socket::{Connection, Stream};
 use super::step::{Stepped, lead};

@@ -1,23 +1,23 @@
 //! Measurements a user runs on their own machine: `cz bench`.
 
-mod corridors;
 mod instructions;
 mod latency;
 mod machine;
 mod peer;
 mod scale;
 mod shared_word;
+mod side_by_side;
 mod socket;
 mod solver;
 mod step;
 mod sumo;
 mod waiting;
 
-pub use corridors::corridors;
 pub use latency::{LatencyOptions, LatencyReport, latency, two_processes};
 pub use machine::Machine;
 pub use peer::{PeerKind, keep_busy, run_peer};
 pub use scale::{ScaleOptions, ScaleReport, scale};
+pub use side_by_side::{Family, side_by_side};
 pub use solver::{SolverReport, solver};
 pub use sumo::{Sumo, SumoSide};
 pub use waiting::{NINE, Side, THREE, Timed, WaitingOptions, WaitingPoint, WaitingReport, waiting};
@@ -25,6 +25,7 @@ pub use waiting::{NINE, Side, THREE, Timed, WaitingOptions, WaitingPoint, Waitin
 use crate::lockstep::LockstepError;
 use crate::process::ProcessError;
 use crate::transport::iox::SpaceError;
+use std::time::Duration;
 
 /// Why a measurement could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -78,6 +79,9 @@ pub enum BenchError {
     #[error("{0}")]
     Disagreement(String),
 }
+
+/// How long anything is waited for.
+const PATIENCE: Duration = Duration::from_secs(10);
 
 fn io(what: &'static str) -> impl Fn(std::io::Error) -> BenchError {
     move |source| BenchError::Io { what, source }

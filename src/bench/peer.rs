@@ -3,7 +3,7 @@
 use super::shared_word::SharedWords;
 use super::socket::{Connection, Stream};
 use super::step::{CONTROLLER, follow};
-use super::{BenchError, io};
+use super::{BenchError, PATIENCE, io};
 use crate::control::ControllerPool;
 use crate::lockstep::{ControllerDriver, ControllerPorts, Members};
 use crate::process::{Placement, expected_vehicles, place};
@@ -17,7 +17,7 @@ use std::net::TcpStream;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// What the other process is to do, and where.
 #[derive(Clone, Debug)]
@@ -52,9 +52,6 @@ pub enum PeerKind {
         port: u16,
     },
 }
-
-/// How long anything is waited for.
-pub(super) const PATIENCE: Duration = Duration::from_secs(10);
 
 /// Runs the other process.
 pub fn run_peer(kind: &PeerKind, scenario: &Arc<Scenario>) -> Result<(), BenchError> {

@@ -1,7 +1,7 @@
 //! A whole step with two processes: world and coordinator here, the controller in another process.
 
 use super::BenchError;
-use super::peer::PATIENCE;
+use super::PATIENCE;
 use crate::coordination::Coordinator;
 use crate::lockstep::{
     ControllerDriver, CoordinatorDriver, CoordinatorPorts, Identity, Members, Progress, WorldDriver,

@@ -107,6 +107,20 @@ impl Row {
             has_left: false,
         }
     }
+
+    /// Whether one that follows another on a lane is behind it until the other's tail has left the lane: on one way, or when
+    /// it keeps at least the other's length. Otherwise it may turn off beside it while it still reaches back.
+    fn stays_behind(&self, other: &Row) -> bool {
+        (self.path, self.next_path) == (other.path, other.next_path)
+            || self.gap_m + other.extra_m >= other.length_m
+    }
+}
+
+/// Whether one that passes later is behind the other on their common stretch. Who has left the zone stands at the head
+/// of the order: before those of its own exit, all of whom it has passed; but of others one may be inside that
+/// is ahead of it.
+fn may_hide(conflicts: &Conflicts, nearer: &Row, other: &Row) -> bool {
+    !other.has_left || conflicts.exit(nearer.path) == conflicts.exit(other.path)
 }
 
 /// The duties of one zone's vehicles; kept from use to use for its allocations.
@@ -117,8 +131,10 @@ pub struct Duties {
     ends: Vec<u32>,
     /// The latest row of each way (path and next path), the latest last.
     latest: Vec<usize>,
-    covered: Vec<(f64, f64)>,
-    lanes: Vec<u32>,
+    /// Stretches of the row's way on which somebody nearer has been found, and who, by place in the order.
+    covered: Vec<(f64, f64, usize)>,
+    /// The same for lanes that cross.
+    lanes: Vec<(u32, usize)>,
 }
 
 impl Duties {
@@ -179,10 +195,17 @@ impl Duties {
                 // A newcomer may be a rounding before the origin.
                 let behind = row.x_m >= run.from_m || run.from_m == 0.0;
                 let from_m = if behind { f64::NEG_INFINITY } else { run.from_m };
-                if covered.iter().any(|&(from, to)| from <= from_m && to >= run.to_m) {
+                let hides = |&(from, to, nearer): &(f64, f64, usize)| {
+                    from <= from_m && to >= run.to_m && {
+                        let nearer = &rows[nearer];
+                        let goes_on = run.to_m == f64::INFINITY;
+                        may_hide(conflicts, nearer, other) && (goes_on || nearer.stays_behind(other))
+                    }
+                };
+                if covered.iter().any(hides) {
                     return;
                 }
-                covered.push((from_m, run.to_m));
+                covered.push((from_m, run.to_m, at));
                 let point = conflicts.uses(row.path).iter().find(|u| !behind && u.at_m == run.from_m);
                 all.push(Duty {
                     kind: if behind { DutyKind::RearEnd } else { DutyKind::Merge },
@@ -194,7 +217,7 @@ impl Duties {
                     until_m,
                 });
             });
-            if covered.contains(&(f64::NEG_INFINITY, f64::INFINITY)) {
+            if conflicts.has_one_exit() && covered.contains(&(f64::NEG_INFINITY, f64::INFINITY, at)) {
                 break;
             }
         }
@@ -213,10 +236,13 @@ impl Duties {
                 let other = &rows[at];
                 let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
                 let Some(theirs) = theirs.filter(|u| !u.on_lane_of(own)) else { continue };
-                if lanes.contains(&theirs.lane()) {
+                let hides = |&(lane, nearer): &(u32, usize)| {
+                    lane == theirs.lane() && may_hide(conflicts, &rows[nearer], other)
+                };
+                if lanes.iter().any(hides) {
                     continue;
                 }
-                lanes.push(theirs.lane());
+                lanes.push((theirs.lane(), at));
                 let gap_m = point.area_m + other.length_m;
                 let until_m = theirs.at_m + gap_m + row.reach_m;
                 if other.x_m < until_m {

@@ -59,6 +59,8 @@ struct PathConflicts {
     last_segment: u32,
     /// Where it first meets paths of other entrances, m; infinite when it does not.
     meets_from_m: f64,
+    /// Whether it ends on a lane on which paths of other exits drive too.
+    ends_among_others: bool,
     /// Ascending by place.
     uses: Vec<Use>,
     /// Stretches of segments shared with other paths, by path.
@@ -87,6 +89,7 @@ impl Conflicts {
             exit: path.exit,
             last_segment: *path.segments.last().expect("a path has segments"),
             meets_from_m: f64::INFINITY,
+            ends_among_others: false,
             uses: Vec::new(),
             shared: Vec::new(),
         });
@@ -108,6 +111,13 @@ impl Conflicts {
         conflicts.find_merges(zone);
         conflicts.find_crossings(zone);
         conflicts.find_shared(zone);
+        for (own, shape) in zone.paths.iter().enumerate() {
+            let path = &conflicts.paths[own];
+            let ends_with = |(with, run): &(u32, Run)| {
+                run.to_m == path.length_m && zone.paths[*with as usize].exit != shape.exit
+            };
+            conflicts.paths[own].ends_among_others = path.shared.iter().any(ends_with);
+        }
         for path in &mut conflicts.paths {
             path.uses.sort_by(|a, b| a.at_m.total_cmp(&b.at_m));
             path.meets_from_m = path.uses.first().map_or(f64::INFINITY, |first| first.at_m);
@@ -142,19 +152,26 @@ impl Conflicts {
         self.paths[path as usize].exit
     }
 
+    /// Whether all paths leave by one exit.
+    pub fn has_one_exit(&self) -> bool {
+        self.exits.len() == 1
+    }
+
     /// Where a path first meets others than those of its own lane, m; infinite when it does not.
     pub fn meets_from_m(&self, path: u32) -> f64 {
         self.paths[path as usize].meets_from_m
     }
 
-    /// How far behind a path's end a vehicle of this length still stands in a conflict area of the zone, or may
-    /// count there for one that keeps `reach_m` at most, m; 0 or less when no crossing is near the end.
+    /// How far behind a path's end a vehicle of this length still stands in a conflict area of the zone or on a lane of
+    /// paths to other exits, or may count there for one that keeps `reach_m` at most, m; 0 or less when neither is
+    /// near the end.
     pub fn clears_behind_m(&self, path: u32, length_m: f64, reach_m: f64) -> f64 {
         let path = &self.paths[path as usize];
         let crossings =
             path.uses.iter().filter(|u| self.points[u.point as usize].kind == PointKind::Crossing);
         let clears = crossings.map(|u| u.at_m + self.points[u.point as usize].area_m + length_m + reach_m);
-        clears.fold(f64::NEG_INFINITY, f64::max) - path.length_m
+        let behind_m = clears.fold(f64::NEG_INFINITY, f64::max) - path.length_m;
+        if path.ends_among_others { behind_m.max(length_m) } else { behind_m }
     }
 
     fn find_merges(&mut self, zone: &Zone) {

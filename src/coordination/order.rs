@@ -9,7 +9,7 @@ use super::schedule::{Scene, Scheduler};
 use crate::conflict::{Conflicts, Duties, Row};
 use crate::scenario::{PassingOrder, Scenario};
 use crate::shield::{Shield, yielding_slack_m};
-use ipc_schemas::VehicleState;
+use ipc_schemas::{STATE_ENTERED, VehicleState};
 
 /// A vehicle that lets a newcomer pass first keeps at least this much slack, m: it is not to brake hard for it.
 const YIELDING_SLACK_M: f64 = 0.5;
@@ -88,7 +88,9 @@ impl Orders {
             order.vehicles.extend(members.iter().map(|state| state.vehicle));
             return;
         }
-        let is_member = |vehicle: u32| members.iter().any(|state| state.vehicle == vehicle);
+        // One that has come back within a step, by a way from the zone to itself, is a newcomer too.
+        let stays = |state: &VehicleState| state.flags & STATE_ENTERED == 0;
+        let is_member = |vehicle: u32| members.iter().any(|s| s.vehicle == vehicle && stays(s));
         order.vehicles.retain(|vehicle| is_member(*vehicle));
         order.passed.retain(|(vehicle, _)| is_member(*vehicle));
         for state in members {

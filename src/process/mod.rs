@@ -23,7 +23,7 @@ pub use attach::{Attachment, Joining};
 pub use observe::{Observation, RecordLag};
 pub use outcome::{LatencyBin, LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, new_histogram};
 pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
-pub use participant::{run_controller, run_coordinator};
+pub use participant::{Conduct, run_controller, run_coordinator};
 pub use peers::{Peer, Peers, children_of, is_orphaned, is_stopped};
 pub use placement::{Affinity, Placement, place, unplaced};
 pub use realtime::{Held, Settled, Settling};

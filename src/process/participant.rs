@@ -2,7 +2,7 @@
 
 use super::services::{controller_ropes, expected_vehicles, rope_of};
 use super::wait::Participant;
-use super::{Attachment, Joining, Patience, ProcessError, Settling, StopFlag, WaitMode, Waiter};
+use super::{Attachment, Held, Joining, Patience, ProcessError, Settling, StopFlag, WaitMode, Waiter};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::lockstep::{
@@ -10,7 +10,7 @@ use crate::lockstep::{
     LockstepError, Members, Progress, RefusedFrames,
 };
 use crate::scenario::share::{neighbour_coordinators, zones_of};
-use crate::transport::iox::{IoxInbox, RunName, RunSpace};
+use crate::transport::iox::{Bell, IoxInbox, RunName, RunSpace};
 use crate::transport::{Inbox, Outbox};
 use ipc_schemas::{
     self as frames, Assignment, AttachReply, Member, Role, VehicleCommand, VehicleState, ZoneSummary,
@@ -21,36 +21,38 @@ use std::time::Duration;
 /// dies is noticed at once, and this bounds the wait for one that hangs.
 const BETWEEN_EVENTS: Duration = Duration::from_secs(3600);
 
-/// Runs a coordinator process to the end of the run; then `refused` is told whose frames it has refused, also
-/// when it fails.
-pub fn run_coordinator(
-    run: &RunName,
-    joining: Joining,
-    peer_timeout: Duration,
-    settling: &Settling<'_>,
-    refused: &dyn Fn(RefusedFrames),
-    stop: &StopFlag,
-) -> Result<(), ProcessError> {
-    // The others may come as late as the world waits for them; whoever stops waiting first is not to be this one.
-    let until_begun = joining.timeout + peer_timeout;
-    let space = RunSpace::enter(run)?;
-    let attachment = Attachment::join(&space, run, joining, stop)?;
-    let AttachReply { index, coordinators, controllers, .. } = attachment.reply;
+/// How a coordinator or controller process is to conduct itself.
+#[derive(Clone, Copy)]
+pub struct Conduct<'a> {
+    /// How it joins.
+    pub joining: Joining,
+    /// How long it waits for a frame.
+    pub peer_timeout: Duration,
+    /// Cores and scheduling.
+    pub settling: &'a Settling<'a>,
+    /// Told at the end, also of a failure, whose frames it has refused.
+    pub refused: &'a dyn Fn(RefusedFrames),
+    /// Set when it is to stop.
+    pub stop: &'a StopFlag,
+}
+
+/// Runs a coordinator process to the end of the run.
+pub fn run_coordinator(run: &RunName, conduct: Conduct<'_>) -> Result<(), ProcessError> {
+    let joined = Joined::to(run, Role::Coordinator, conduct)?;
+    let AttachReply { index, coordinators, controllers, .. } = joined.attachment.reply;
+    let Joined { space, attachment, wait, .. } = &joined;
     let scenario = &attachment.scenario;
     let zones = scenario.network.zones.len() as u32;
     let mask = neighbour_coordinators(&scenario.network, coordinators)[index as usize];
     let own = |prefix: &str| format!("{prefix}{index}");
-    let wait = WaitMode::from_code(attachment.reply.waiting);
     let bells = &attachment.bells;
-    let bell = wait.has_bell(Role::Coordinator).then(|| bells.bell(Role::Coordinator, index));
-    let held = settling.settle(Role::Coordinator, index, wait, wait.hot_processes(coordinators, controllers));
     let neighbours = (0..coordinators)
         .filter(|n| mask >> n & 1 == 1)
         .map(|n| {
             let service = space.open(&format!("{}{n}", frames::SERVICE_SUMMARY_PREFIX))?;
             let owned = zones_of(zones, n, coordinators);
             let expected = owned.len();
-            let rope = rope_of(bells, wait, Role::Coordinator, n);
+            let rope = rope_of(bells, *wait, Role::Coordinator, n);
             Ok((n as u16, owned, service.outbox(expected)?.ringing(rope)))
         })
         .collect::<Result<_, ProcessError>>()?;
@@ -62,44 +64,19 @@ pub fn run_coordinator(
         coordination: space
             .open(frames::SERVICE_COORDINATION)?
             .outbox(2 * expected_vehicles(scenario))?
-            .ringing(controller_ropes(bells, wait, controllers)),
-        members: members(&space, &attachment.reply)?,
+            .ringing(controller_ropes(bells, *wait, controllers)),
+        members: joined.members()?,
     };
     let role = Coordinator::new(scenario.clone(), zones_of(zones, index, coordinators));
-    let identity = identity(&attachment.reply, Role::Coordinator);
-    let mut driver = CoordinatorDriver::new(role, ports, identity);
-    if let Some(handover) = attachment.ready(stop)? {
-        driver.take_over(handover);
-    }
-    let hot_processes = 1 + controllers as usize;
-    // Declared last, so let go first.
-    let _held = held;
-    let patience = Patience::of(wait, Role::Coordinator, hot_processes, BETWEEN_EVENTS.max(peer_timeout));
-    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world()).begin_within(until_begun);
-    let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
-    driver.refused().into_iter().for_each(refused);
-    end
+    let driver = CoordinatorDriver::new(role, ports, joined.identity());
+    joined.drive(driver, BETWEEN_EVENTS.max(conduct.peer_timeout), CoordinatorDriver::refused)
 }
 
-/// Runs a controller process with the built-in law to the end of the run; then `refused` is told whose frames it
-/// has refused, also when it fails.
-pub fn run_controller(
-    run: &RunName,
-    joining: Joining,
-    peer_timeout: Duration,
-    settling: &Settling<'_>,
-    refused: &dyn Fn(RefusedFrames),
-    stop: &StopFlag,
-) -> Result<(), ProcessError> {
-    // The others may come as late as the world waits for them; whoever stops waiting first is not to be this one.
-    let until_begun = joining.timeout + peer_timeout;
-    let space = RunSpace::enter(run)?;
-    let attachment = Attachment::join(&space, run, joining, stop)?;
-    let AttachReply { index, coordinators, controllers, first_step, .. } = attachment.reply;
-    let wait = WaitMode::from_code(attachment.reply.waiting);
-    let bells = &attachment.bells;
-    let bell = wait.has_bell(Role::Controller).then(|| bells.bell(Role::Controller, index));
-    let held = settling.settle(Role::Controller, index, wait, wait.hot_processes(coordinators, controllers));
+/// Runs a controller process with the built-in law to the end of the run.
+pub fn run_controller(run: &RunName, conduct: Conduct<'_>) -> Result<(), ProcessError> {
+    let joined = Joined::to(run, Role::Controller, conduct)?;
+    let AttachReply { index, controllers, first_step, .. } = joined.attachment.reply;
+    let Joined { space, attachment, wait, .. } = &joined;
     let scenario = &attachment.scenario;
     // Plug-ins come behind the processes of the pool.
     let pool = controllers - scenario.plugins.len() as u32;
@@ -111,22 +88,71 @@ pub fn run_controller(
             command: space
                 .open(frames::SERVICE_COMMAND)?
                 .outbox(expected_vehicles(scenario))?
-                .ringing(rope_of(bells, wait, Role::World, 0)),
-            members: members(&space, &attachment.reply)?,
+                .ringing(rope_of(&attachment.bells, *wait, Role::World, 0)),
+            members: joined.members()?,
         };
     let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
-    let identity = identity(&attachment.reply, Role::Controller);
-    let mut driver = ControllerDriver::new(role, ports, identity, first_step);
-    if let Some(handover) = attachment.ready(stop)? {
-        driver.take_over(handover);
+    let driver = ControllerDriver::new(role, ports, joined.identity(), first_step);
+    joined.drive(driver, conduct.peer_timeout, ControllerDriver::refused)
+}
+
+/// A process that has been let in and settled, and has no ports yet.
+struct Joined<'a> {
+    space: RunSpace,
+    attachment: Attachment,
+    role: Role,
+    wait: WaitMode,
+    bell: Option<Bell>,
+    held: Held,
+    conduct: Conduct<'a>,
+}
+
+impl<'a> Joined<'a> {
+    fn to(run: &RunName, role: Role, conduct: Conduct<'a>) -> Result<Joined<'a>, ProcessError> {
+        let space = RunSpace::enter(run)?;
+        let attachment = Attachment::join(&space, run, conduct.joining, conduct.stop)?;
+        let AttachReply { index, coordinators, controllers, waiting, .. } = attachment.reply;
+        let wait = WaitMode::from_code(waiting);
+        let bell = wait.has_bell(role).then(|| attachment.bells.bell(role, index));
+        let held = conduct.settling.settle(role, index, wait, wait.hot_processes(coordinators, controllers));
+        Ok(Joined { space, attachment, role, wait, bell, held, conduct })
     }
-    // Declared last, so let go first.
-    let _held = held;
-    let patience = Patience::of(wait, Role::Controller, 1 + controllers as usize, peer_timeout);
-    let mut waiter = Waiter::new(patience, bell, stop.clone(), attachment.world()).begin_within(until_begun);
-    let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
-    driver.refused().into_iter().for_each(refused);
-    end
+
+    fn identity(&self) -> Identity {
+        let AttachReply { run_id, index, generation, .. } = self.attachment.reply;
+        Identity { run_id, role: self.role, index: index as u16, generation }
+    }
+
+    /// Whom to believe, as the world says.
+    fn members(&self) -> Result<Members<IoxInbox<Member>>, ProcessError> {
+        let inbox = self.space.open(frames::SERVICE_MEMBERS)?.inbox()?;
+        Ok(Members::told_by(self.attachment.reply.world_process_id, inbox))
+    }
+
+    /// Says that it is ready, goes on from what it is handed over, and drives to the end of the run.
+    fn drive<D: Participant, R: IntoIterator<Item = RefusedFrames>>(
+        self,
+        mut driver: D,
+        timeout: Duration,
+        refused: impl Fn(&D) -> R,
+    ) -> Result<(), ProcessError> {
+        let Conduct { joining, peer_timeout, stop, .. } = self.conduct;
+        let attachment = &self.attachment;
+        if let Some(handover) = attachment.ready(stop)? {
+            driver.take_over(handover);
+        }
+        // Let go before the ports are.
+        let _held = self.held;
+        // World and controllers are hot beside it.
+        let hot_processes = 1 + attachment.reply.controllers as usize;
+        let patience = Patience::of(self.wait, self.role, hot_processes, timeout);
+        let waiter = Waiter::new(patience, self.bell, stop.clone(), attachment.world());
+        // The others may come as late as the world waits for them; whoever stops waiting first is not to be this one.
+        let mut waiter = waiter.begin_within(joining.timeout + peer_timeout);
+        let end = waiter.drive(&mut driver, || attachment.catch_up(stop));
+        refused(&driver).into_iter().for_each(self.conduct.refused);
+        end
+    }
 }
 
 impl<S, N, O, A, M> Participant for CoordinatorDriver<S, N, O, A, M>
@@ -160,14 +186,4 @@ where
     fn take_over(&mut self, handover: Handover) {
         self.take_over(handover);
     }
-}
-
-fn identity(reply: &AttachReply, role: Role) -> Identity {
-    Identity { run_id: reply.run_id, role, index: reply.index as u16, generation: reply.generation }
-}
-
-/// Whom to believe, as the world says.
-fn members(space: &RunSpace, reply: &AttachReply) -> Result<Members<IoxInbox<Member>>, ProcessError> {
-    let inbox = space.open(frames::SERVICE_MEMBERS)?.inbox()?;
-    Ok(Members::told_by(reply.world_process_id, inbox))
 }

@@ -3,77 +3,63 @@
 //! The loader refuses with places and keys; here there are none, and whoever meets a fault holds a file that
 //! no version of this program wrote.
 
-use super::ranges::{self, Range};
+use super::fault::{Check, ScenarioFault, inside, number, require, within};
+use super::keys;
+use super::network::entrance_without_way_out;
+use super::ranges::{self, MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_KINDS, MAX_RATE_PER_HOUR, MAX_TIME_S};
 use super::{
-    Baseline, Demand, Exit, Faults, FlowPolicy, Network, Observed, Path, Poisson, Scenario, Scope,
-    SensorKind, Source, Span, VehicleParams, Zone,
+    Demand, Faults, Network, Path, Poisson, Scenario, Scope, SensorKind, Source, Span, VehicleParams, Zone,
+    flow,
 };
-use crate::scenario::load::{MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_KINDS, MAX_RATE_PER_HOUR, MAX_TIME_S};
-
-/// The first thing in a scenario that is not as the loader leaves it.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct ScenarioFault(String);
-
-type Check = Result<(), ScenarioFault>;
-
-fn require(holds: bool, what: impl FnOnce() -> String) -> Check {
-    if holds { Ok(()) } else { Err(ScenarioFault(what())) }
-}
-
-/// Whether a number is finite and within a range; NaN is in none.
-fn number(what: &str, value: f64, within: impl FnOnce(f64) -> bool) -> Check {
-    require(value.is_finite() && within(value), || format!("{what} = {value}"))
-}
-
-fn within(what: &str, value: f64, range: &Range) -> Check {
-    number(what, value, |value| range.contains(value))
-}
 
 impl Scenario {
     /// Checks every value and index as the loader does.
     pub fn check(&self) -> Result<(), ScenarioFault> {
         let dt_s = self.dt_s();
-        within("dt_s", dt_s, &ranges::STEP)?;
+        within(&keys::DT, dt_s)?;
         let longest_s = MAX_TIME_S.min(dt_s * ranges::MAX_STEPS);
         number("max_time_s", self.max_time_s, |t| t >= dt_s && t <= longest_s)?;
         require(self.max_vehicles != Some(0), || "max_vehicles = 0".to_owned())?;
-        within("beta", self.beta, &ranges::BETA)?;
+        within(&keys::BETA, self.beta)?;
         vehicle(&self.vehicle)?;
         require(!self.fleet.is_empty() && self.fleet.len() <= MAX_KINDS, || "the fleet".to_owned())?;
         for kind in &self.fleet {
             vehicle(&kind.vehicle)?;
-            within("share", kind.share, &ranges::SHARE)?;
+            within(&keys::SHARE, kind.share)?;
             // Steps and paths are sized for the fastest.
             number("v_max_mps", kind.vehicle.v_max_mps, |v| v <= self.vehicle.v_max_mps)?;
         }
         let control = &self.control;
-        for (what, gain) in [
-            ("k_rear_end_per_s", control.k_rear_end_per_s),
-            ("k_merge_per_s", control.k_merge_per_s),
-            ("k_speed_per_s", control.k_speed_per_s),
-            ("clf_rate_per_s", control.clf_rate_per_s),
+        for (key, value) in [
+            (&keys::K_REAR_END, control.k_rear_end_per_s),
+            (&keys::K_MERGE, control.k_merge_per_s),
+            (&keys::K_SPEED, control.k_speed_per_s),
+            (&keys::CLF_RATE, control.clf_rate_per_s),
+            (&keys::SLACK_WEIGHT, control.slack_weight),
         ] {
-            within(what, gain, &ranges::GAIN)?;
+            within(key, value)?;
         }
-        within("price_of_time", self.coordination.price_of_time, &ranges::PRICE_OF_TIME)?;
-        within("tandem_weight", self.coordination.tandem_weight, &ranges::TANDEM_WEIGHT)?;
-        within("slack_weight", control.slack_weight, &ranges::SLACK_WEIGHT)?;
+        within(&keys::PRICE_OF_TIME, self.coordination.price_of_time)?;
+        within(&keys::TANDEM_WEIGHT, self.coordination.tandem_weight)?;
         let viable = &control.viable;
-        within("k_comfort_per_s", viable.k_comfort_per_s, &ranges::GAIN)?;
-        within("k_recovery_per_s", viable.k_recovery_per_s, &ranges::GAIN)?;
-        within("clearance_m", viable.clearance_m, &ranges::STANDSTILL_GAP)?;
-        within("buffer_m", viable.buffer_m, &ranges::STANDSTILL_GAP)?;
-        within("buffer_s", viable.buffer_s, &ranges::REACTION_TIME)?;
-        within("passage_weight", viable.passage_weight, &ranges::SHARE)?;
+        for (key, value) in [
+            (&keys::K_COMFORT, viable.k_comfort_per_s),
+            (&keys::K_RECOVERY, viable.k_recovery_per_s),
+            (&keys::CLEARANCE, viable.clearance_m),
+            (&keys::BUFFER, viable.buffer_m),
+            (&keys::BUFFER_TIME, viable.buffer_s),
+            (&keys::PASSAGE_WEIGHT, viable.passage_weight),
+        ] {
+            within(key, value)?;
+        }
         number("fe_fraction", control.fe_fraction, |f| f > 0.0 && f <= 1.0)?;
         network(&self.network, self.vehicle.v_max_mps * dt_s, self.vehicle.v_max_mps)?;
         for exit in self.network.zones.iter().flat_map(|zone| &zone.exits) {
-            flow(exit, &self.network, self.vehicle.v_max_mps)?;
+            flow::check(exit, &self.network, self.vehicle.v_max_mps)?;
         }
         for road in &self.network.roads {
             demand(&road.demand, &self.vehicle, road.routes.len())
-                .map_err(|fault| ScenarioFault(format!("road {}: {fault}", road.name)))?;
+                .map_err(|fault| ScenarioFault::of(format!("road {}: {fault}", road.name)))?;
         }
         self.check_plugins()?;
         self.faults.as_ref().map_or(Ok(()), |faults| self.check_faults(faults))
@@ -146,14 +132,14 @@ fn span(span: &Span) -> Check {
 }
 
 fn vehicle(v: &VehicleParams) -> Check {
-    within("u_min_mps2", v.u_min_mps2, &ranges::BRAKING)?;
-    within("u_max_mps2", v.u_max_mps2, &ranges::ACCELERATION)?;
-    within("v_min_mps", v.v_min_mps, &ranges::LEAST_SPEED)?;
-    within("v_max_mps", v.v_max_mps, &ranges::GREATEST_SPEED)?;
+    within(&keys::U_MIN, v.u_min_mps2)?;
+    within(&keys::U_MAX, v.u_max_mps2)?;
+    within(&keys::V_MIN, v.v_min_mps)?;
+    within(&keys::V_MAX, v.v_max_mps)?;
     number("v_max_mps", v.v_max_mps, |s| s > v.v_min_mps)?;
-    within("length_m", v.length_m, &ranges::VEHICLE_LENGTH)?;
-    within("reaction_time_s", v.reaction_time_s, &ranges::REACTION_TIME)?;
-    within("standstill_gap_m", v.standstill_gap_m, &ranges::STANDSTILL_GAP)
+    within(&keys::LENGTH, v.length_m)?;
+    within(&keys::REACTION_TIME, v.reaction_time_s)?;
+    within(&keys::STANDSTILL_GAP, v.standstill_gap_m)
 }
 
 /// Indices point at something, both ends of a connection know of each other, and every zone has a way out.
@@ -185,26 +171,17 @@ fn network(network: &Network, step_m: f64, v_max_mps: f64) -> Check {
             let there = zones.get(to.zone as usize).and_then(|z| z.segments.get(to.segment as usize));
             let source = Source::Zone { zone: index, exit: at };
             require(there.is_some_and(|segment| segment.source == Some(source)), bad)?;
-            within("link_m", to.link_m, &ranges::LINK_LENGTH)?;
+            inside("link_m", to.link_m, &ranges::LINK_LENGTH)?;
             number("link_m", to.link_m, |l| l == 0.0 || l >= step_m)?;
             let is_speed = |v| ranges::LINK_SPEED.contains(v) && v <= v_max_mps;
             number("link_speed_mps", to.link_speed_mps, is_speed)?;
         }
     }
-    let is_way_out = |zone: &Zone| zone.exits.iter().any(|exit| exit.to.is_none());
-    let mut has_way: Vec<bool> = zones.iter().map(is_way_out).collect();
-    let mut found: Vec<usize> = (0..zones.len()).filter(|&zone| has_way[zone]).collect();
-    while let Some(zone) = found.pop() {
-        for feeder in network.upstream(zone as u32) {
-            if !std::mem::replace(&mut has_way[feeder as usize], true) {
-                found.push(feeder as usize);
-            }
-        }
-    }
-    require(has_way.iter().all(|has| *has), || "a zone from which nobody comes out".to_owned())?;
+    let has_way_out = entrance_without_way_out(zones).is_none();
+    require(has_way_out, || "an entrance from which nobody comes out".to_owned())?;
     for road in roads {
         for route in &road.routes {
-            within("share", route.share, &ranges::SHARE)?;
+            within(&keys::SHARE, route.share)?;
             let (mut at, mut segment) = (Some(road.zone), road.segment);
             for &path in &route.paths {
                 let zone = at.map(|zone| &zones[zone as usize]);
@@ -227,7 +204,7 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
     let mut is_used = vec![false; zone.segments.len()];
     let mut is_left_by = vec![false; zone.exits.len()];
     for segment in &zone.segments {
-        within("length_m", segment.length_m, &ranges::SEGMENT_LENGTH)?;
+        inside("length_m", segment.length_m, &ranges::SEGMENT_LENGTH)?;
         require(segment.shape.iter().flatten().all(|m| m.abs() <= 1e7), bad)?;
         require(segment.shape.len() != 1, bad)?;
     }
@@ -242,15 +219,15 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
             length_m += segment.map_or(0.0, |s| s.length_m);
         }
         require(path.length_m == length_m, bad)?;
-        within("length_m", length_m, &ranges::APPROACH_LENGTH)?;
+        inside("length_m", length_m, &ranges::APPROACH_LENGTH)?;
         number("length_m", length_m, |l| l >= step_m)?;
-        within("share", path.share, &ranges::SHARE)?;
+        within(&keys::SHARE, path.share)?;
         require((path.exit as usize) < zone.exits.len(), bad)?;
         is_left_by[path.exit as usize] = true;
     }
     require(is_used.iter().chain(&is_left_by).all(|used| *used), bad)?;
     for crossing in &zone.crossings {
-        within("length_m", crossing.length_m, &ranges::CROSSING_LENGTH)?;
+        inside("length_m", crossing.length_m, &ranges::CROSSING_LENGTH)?;
         require(crossing.places.len() >= 2, bad)?;
         for &(segment, at_m) in &crossing.places {
             let segment = zone.segments.get(segment as usize);
@@ -260,48 +237,6 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
         require(zone.paths.iter().all(|path| passed(path) <= 1), bad)?;
     }
     Ok(())
-}
-
-fn flow(exit: &Exit, network: &Network, v_max_mps: f64) -> Check {
-    let speed = |what, value| number(what, value, |v| ranges::FLOW_SPEED.contains(v) && v <= v_max_mps);
-    let downstream = exit.to.map(|to| &network.zones[to.zone as usize]);
-    let observes = |l: f64| {
-        let longest_m = downstream.map_or(0.0, Zone::longest_m);
-        number("segment_m", l, |l| l > 0.0 && l <= longest_m)
-    };
-    let has_downstream =
-        || require(downstream.is_some(), || format!("exit {}: nothing to observe", exit.name));
-    match &exit.flow {
-        FlowPolicy::None => Ok(()),
-        FlowPolicy::Fixed { terminal_mps } => speed("terminal_mps", *terminal_mps),
-        FlowPolicy::Feedback { baseline, gain_mps, segment, min_mps } => {
-            has_downstream()?;
-            match baseline {
-                Baseline::Given(baseline) => speed("baseline_mps", *baseline)?,
-                Baseline::Optimal(speeds) => {
-                    require(!speeds.is_empty(), || "no baseline_entry_speeds_mps".to_owned())?;
-                    speeds.iter().try_for_each(|v| speed("baseline_entry_speeds_mps", *v))?;
-                }
-            }
-            within("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
-            speed("min_mps", *min_mps)?;
-            match segment {
-                Observed::Whole => Ok(()),
-                Observed::First(l) => observes(*l),
-            }
-        }
-        FlowPolicy::Predicted { min_mps } => {
-            has_downstream()?;
-            speed("min_mps", *min_mps)
-        }
-        FlowPolicy::MeanSpeed { offset_mps, gain_mps, segment_m, min_mps } => {
-            has_downstream()?;
-            within("offset_mps", *offset_mps, &ranges::FLOW_OFFSET)?;
-            within("gain_mps", *gain_mps, &ranges::FLOW_GAIN)?;
-            speed("min_mps", *min_mps)?;
-            observes(*segment_m)
-        }
-    }
 }
 
 fn demand(demand: &Demand, vehicle: &VehicleParams, routes: usize) -> Check {
@@ -320,7 +255,7 @@ fn demand(demand: &Demand, vehicle: &VehicleParams, routes: usize) -> Check {
             return Ok(());
         }
     };
-    within("min_headway_s", *min_headway_s, &ranges::HEADWAY)?;
+    inside("min_headway_s", *min_headway_s, &ranges::HEADWAY)?;
     let mut last_s = 0.0;
     for period in rates {
         number("until_s", period.until_s, |t| t > last_s && t <= MAX_TIME_S)?;
@@ -352,7 +287,9 @@ mod tests {
         let sets = ["controllers=[{name=\"a\",zones=[\"merge-1\"]},{name=\"b\",paths=[\"merge-2.main\"]}]"];
         let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
         assert_eq!(load(None, &sets, None).unwrap().check(), Ok(()));
-        assert_eq!(crate::bench::corridors(500, 60.0).unwrap().check(), Ok(()));
+        for family in [crate::bench::Family::Corridors, crate::bench::Family::Grids] {
+            assert_eq!(crate::bench::side_by_side(family, 500, 60.0).unwrap().check(), Ok(()));
+        }
     }
 
     fn faults(scenario: &mut Scenario) -> &mut Faults {

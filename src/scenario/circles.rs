@@ -7,19 +7,18 @@
 use super::Scenario;
 use super::network::{Network, ZoneId};
 use std::cmp::Reverse;
-use std::collections::BinaryHeap;
+use std::collections::{BTreeMap, BinaryHeap};
 
 /// A vehicle that stands more than this behind where it need not stop any more drives on, m.
 const STANDING_RESERVE_M: f64 = 5.0;
-/// Sets of circles are bit masks; further circles count as the last one.
-const MAX_CIRCLES: usize = 32;
-
 /// The circles of a network, and which of them each path can lead into.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Circles {
     /// The greatest number of vehicles that may be on their way into, on, or behind each.
     pub capacity: Vec<u32>,
-    /// By zone and path, the circles that it is part of or leads into, one bit each; empty without circles.
+    /// Sets of circles, ascending; the first is empty.
+    sets: Vec<Vec<u32>>,
+    /// By zone and path, which set it is part of or leads into; empty without circles.
     reach: Vec<Vec<u32>>,
 }
 
@@ -34,30 +33,30 @@ impl Circles {
         let kinds = scenario.fleet.iter().map(|kind| &kind.vehicle);
         let spacing_m =
             kinds.map(|v| v.length_m.max(v.standstill_gap_m)).fold(0.0, f64::max) + STANDING_RESERVE_M;
-        let mut capacity: Vec<u32> = Vec::new();
-        let mut masks = vec![0u32; nodes.all.len()];
-        for members in components {
+        let mut capacity: Vec<u32> = Vec::with_capacity(components.len());
+        let mut ahead: Vec<Vec<u32>> = vec![Vec::new(); nodes.all.len()];
+        let before = nodes.before();
+        for (circle, members) in (0..).zip(components) {
             let around_m = nodes.shortest_circle_m(&members);
-            let room = ((around_m / spacing_m) as u32).saturating_sub(1).max(1);
-            let bit = capacity.len().min(MAX_CIRCLES - 1);
-            match capacity.get_mut(bit) {
-                Some(least) => *least = room.min(*least),
-                None => capacity.push(room),
-            }
-            members.iter().for_each(|&node| masks[node] |= 1 << bit);
+            capacity.push(((around_m / spacing_m) as u32).saturating_sub(1).max(1));
+            nodes.mark(circle, members, &before, &mut ahead);
         }
-        nodes.spread(&mut masks);
+        let mut known = BTreeMap::from([(Vec::new(), 0)]);
+        let mut sets = vec![Vec::new()];
         let mut reach: Vec<Vec<u32>> =
             scenario.network.zones.iter().map(|z| vec![0; z.paths.len()]).collect();
-        for (&(zone, path), mask) in nodes.all.iter().zip(masks) {
-            reach[zone as usize][path as usize] = mask;
+        for (&(zone, path), set) in nodes.all.iter().zip(ahead) {
+            reach[zone as usize][path as usize] = *known.entry(set).or_insert_with_key(|set| {
+                sets.push(set.clone());
+                sets.len() as u32 - 1
+            });
         }
-        Circles { capacity, reach }
+        Circles { capacity, sets, reach }
     }
 
-    /// The circles a vehicle on a path may come into, one bit each.
-    pub fn ahead_of(&self, zone: ZoneId, path: u32) -> u32 {
-        self.reach.get(zone as usize).map_or(0, |paths| paths[path as usize])
+    /// The circles a vehicle on a path may come into, ascending.
+    pub fn ahead_of(&self, zone: ZoneId, path: u32) -> &[u32] {
+        self.reach.get(zone as usize).map_or(&[], |paths| &self.sets[paths[path as usize] as usize])
     }
 }
 
@@ -164,19 +163,22 @@ impl Nodes {
         best_m
     }
 
-    /// Gives every path what those behind it have.
-    fn spread(&self, masks: &mut [u32]) {
+    /// The paths before each.
+    fn before(&self) -> Vec<Vec<usize>> {
         let mut before: Vec<Vec<usize>> = vec![Vec::new(); self.all.len()];
         for (node, next) in self.next.iter().enumerate() {
             next.iter().for_each(|&next| before[next].push(node));
         }
-        let mut work: Vec<usize> = (0..masks.len()).filter(|&node| masks[node] != 0).collect();
+        before
+    }
+
+    /// Marks the paths of a circle, and all that lead into it. Circles are marked in ascending order.
+    fn mark(&self, circle: u32, members: Vec<usize>, before: &[Vec<usize>], ahead: &mut [Vec<u32>]) {
+        let mut work = members;
         while let Some(node) = work.pop() {
-            for &feeder in &before[node] {
-                if masks[feeder] | masks[node] != masks[feeder] {
-                    masks[feeder] |= masks[node];
-                    work.push(feeder);
-                }
+            if ahead[node].last() != Some(&circle) {
+                ahead[node].push(circle);
+                work.extend(&before[node]);
             }
         }
     }
@@ -197,12 +199,27 @@ mod tests {
         let ring = circles("roundabout");
         // 180 m round, standing 6 + 5 m apart.
         assert_eq!(ring.capacity, [15]);
-        let all: Vec<u32> = (0..3)
-            .flat_map(|zone| (0..3).map(move |path| (zone, path)))
-            .map(|(z, p)| ring.ahead_of(z, p))
-            .collect();
-        // Stay, leave, enter.
-        assert_eq!(all, [1, 0, 1, 1, 0, 1, 1, 0, 1]);
+        for zone in 0..3 {
+            // Stay, leave, enter.
+            let ahead: Vec<&[u32]> = (0..3).map(|path| ring.ahead_of(zone, path)).collect();
+            assert_eq!(ahead, [&[0][..], &[], &[0]]);
+        }
         assert_eq!(circles("grid-3x3").capacity.len(), 1);
+    }
+
+    #[test]
+    fn circles_side_by_side_do_not_concern_each_other() {
+        use crate::bench::{Family, side_by_side};
+        let scenario = side_by_side(Family::Grids, 1_500, 60.0).unwrap();
+        let circles = Circles::of(&scenario);
+        let count = scenario.network.zones.len() / 9;
+        assert!(count > 33, "{count}");
+        assert_eq!(circles.capacity, vec![circles.capacity[0]; count]);
+        for (zone, shape) in (0..).zip(&scenario.network.zones) {
+            for path in 0..shape.paths.len() as u32 {
+                let ahead = circles.ahead_of(zone, path);
+                assert!(ahead.is_empty() || ahead == [zone / 9], "{zone} {path} {ahead:?}");
+            }
+        }
     }
 }

@@ -6,29 +6,26 @@
 
 mod demand;
 mod document;
-mod error;
+pub(super) mod error;
 mod faults;
 mod overrides;
 mod plugins;
 mod routes;
 mod scope;
 mod sections;
-mod table;
+pub(super) mod table;
 mod topology;
 
 pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;
 
-use super::{EntryRule, LawKind, Network, Road, Scenario, ShieldMode, embedded, ranges};
+use super::ranges::MAX_TIME_S;
+use super::{LawKind, Network, Road, Scenario, embedded, flow, keys, ranges};
 use demand::{DemandReader, TraceBase};
-pub(super) use demand::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use document::{Document, Node, Origin, Value};
-pub(super) use faults::{MAX_DELAY, MAX_ERROR};
-pub(super) use sections::MAX_KINDS;
 use std::collections::BTreeMap;
 use std::path::Path;
 use table::Table;
-pub(super) use topology::MAX_COUNT;
 
 /// The scenario that runs when none is named.
 pub const DEFAULT_SCENARIO: &str = "two-merges";
@@ -148,23 +145,7 @@ fn load_text(
 
 fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError> {
     let root = Table::root(document);
-    root.only(&[
-        "name",
-        "seed",
-        "dt_s",
-        "end",
-        "vehicle",
-        "objective",
-        "control",
-        "gate",
-        "coordination",
-        "shield",
-        "fleet",
-        "roads",
-        "zones",
-        "controllers",
-        "faults",
-    ])?;
+    root.only_declared(keys::ROOT)?;
     let name = root.name()?.to_owned();
     let seed = match root.get("seed") {
         Some(field) => field.integer(0, "an integer from 0 to 2^64 - 1")?,
@@ -186,14 +167,14 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let road_tables = root.tables("roads", "a list of entry roads, at least one")?;
     let zone_tables = root.tables("zones", "a list of zones, at least one")?;
     for table in &road_tables {
-        table.only(&["name", "demand", "routes", "entry"])?;
+        table.only_declared(keys::ROADS)?;
     }
     for table in &zone_tables {
-        table.only(&topology::ZONE_KEYS)?;
+        table.only_declared(keys::ZONES)?;
     }
     let law = sections::law(control_table.as_ref(), LawKind::default())?;
-    let road_names = topology::unique_names(&road_tables, "road")?;
-    let zone_names = topology::unique_names(&zone_tables, "zone")?;
+    let road_names = table::unique_names(&road_tables, "road")?;
+    let zone_names = table::unique_names(&zone_tables, "zone")?;
     let step_m = vehicle.v_max_mps * dt_s;
     let mut topology = topology::read(
         &zone_tables,
@@ -212,9 +193,9 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
     let mut reader = DemandReader { base, seed, roads: road_names, routes, vehicle, traces: BTreeMap::new() };
     let gate = section("gate")?;
     if let Some(table) = &gate {
-        table.only(&["entry"])?;
+        table.only_declared(keys::GATE)?;
     }
-    let entry_everywhere = sections::entry(gate.as_ref(), EntryRule::default())?;
+    let entry_everywhere = sections::entry(gate.as_ref(), keys::ENTRY.default())?;
     let mut roads = Vec::with_capacity(road_tables.len());
     for (index, (table, &(zone, segment))) in road_tables.iter().zip(&topology.road_ends).enumerate() {
         let demand = reader.read(index as u32, table)?;
@@ -224,10 +205,7 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         roads.push(Road { name, zone, segment, demand, routes, entry });
     }
     let plugins = plugins::read(&root, &topology.zones)?;
-    let shield = root.choice_or_first(
-        "shield",
-        &[("off", ShieldMode::Off), ("observe", ShieldMode::Observe), ("on", ShieldMode::On)],
-    )?;
+    let shield = root.chosen(&keys::SHIELD)?;
     let faults = faults::read(section("faults")?.as_ref(), &topology.zones)?;
     let network = Network { zones: topology.zones, roads };
     Ok(Scenario {
@@ -265,10 +243,10 @@ fn flow_policies(
         for (index, exit) in zone.exits.iter_mut().enumerate() {
             let downstream = exit.to.map(|to| {
                 let (zone, longest_m) = &longest_m[to.zone as usize];
-                sections::Downstream { zone, longest_m: *longest_m }
+                flow::Downstream { zone, longest_m: *longest_m }
             });
             let table = own.get(index).filter(|exit| exit.get("flow").is_some()).unwrap_or(table);
-            exit.flow = sections::flow(table, downstream.as_ref(), vehicle)?;
+            exit.flow = flow::flow(table, downstream.as_ref(), vehicle)?;
         }
     }
     Ok(())
@@ -276,21 +254,22 @@ fn flow_policies(
 
 /// `dt_s` as nanoseconds.
 fn dt_ns(root: &Table<'_>) -> Result<u64, ScenarioError> {
-    let expected = format!("{}, a whole number of nanoseconds", ranges::STEP);
+    let range = keys::DT.range;
+    let expected = format!("{range}, a whole number of nanoseconds");
     // Decimal fractions of a second are not exact in binary: a relative error of some bits is no fraction
     // of a nanosecond.
     let whole = |dt_s: f64| {
         let ns = dt_s * 1e9;
-        ranges::STEP.contains(dt_s) && (ns - ns.round()).abs() <= 1e-12 * ns
+        range.contains(dt_s) && (ns - ns.round()).abs() <= 1e-12 * ns
     };
-    Ok((root.f64_or("dt_s", 0.1, whole, &expected)? * 1e9).round() as u64)
+    Ok((root.f64_or(keys::DT.name, keys::DT.default(), whole, &expected)? * 1e9).round() as u64)
 }
 
 /// `[end]`: greatest number of vehicles, and time in s.
 fn end(table: Option<&Table<'_>>, dt_s: f64) -> Result<(Option<u32>, f64), ScenarioError> {
     const DEFAULT_TIME_S: f64 = 7200.0;
     let Some(t) = table else { return Ok((None, DEFAULT_TIME_S)) };
-    t.only(&["vehicles", "time_s"])?;
+    t.only_declared(keys::END)?;
     let vehicles = match t.get("vehicles") {
         Some(field) => Some(field.integer(1, "an integer from 1 to 4294967295")?),
         None => None,

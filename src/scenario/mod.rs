@@ -10,7 +10,10 @@ pub mod demand;
 pub(crate) mod draw;
 mod embedded;
 pub mod encode;
+mod fault;
 pub mod faults;
+pub mod flow;
+mod keys;
 pub mod layout;
 pub mod load;
 pub mod network;
@@ -21,11 +24,13 @@ pub mod shapes;
 pub mod share;
 
 pub use arrivals::ArrivalStream;
-pub use check::ScenarioFault;
 pub use circles::Circles;
 pub use demand::{Arrival, Demand, Poisson, RatePeriod, SpeedDistribution};
 pub use encode::{DecodeError, decode, encode, keep, kept, scenario_hash};
+pub use fault::ScenarioFault;
 pub use faults::{CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall};
+pub use flow::{Baseline, FlowPolicy, Observed};
+pub use keys::document as keys_document;
 pub use load::{
     DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
     load_recorded, text_of,
@@ -35,8 +40,8 @@ pub use network::{
     Source, Zone, ZoneId,
 };
 pub use params::{
-    Baseline, ControlParams, CoordinationParams, FeConditions, FlowPolicy, Observed, PositionFeedback,
-    ReferenceLaw, Replan, SafetyRows, ScheduleKind, Solver, VehicleKind, VehicleParams, ViableParams,
+    ControlParams, CoordinationParams, FeConditions, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
+    ScheduleKind, Solver, VehicleKind, VehicleParams, ViableParams,
 };
 pub use plugins::{ControllerNames, Drivers, Plugin, ShieldMode};
 

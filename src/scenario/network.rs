@@ -1,8 +1,9 @@
 //! The network: control zones, the exits and links between them, and the entry roads.
 
 use super::demand::Demand;
-use super::params::FlowPolicy;
+use super::flow::FlowPolicy;
 use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// Index of a zone in [`Network::zones`]. Zones are sorted upstream first as far as the network has such an
 /// order; a connection to a zone that does not come later closes a cycle.
@@ -126,6 +127,15 @@ pub enum PassingOrder {
     Resequenced,
 }
 
+impl PassingOrder {
+    /// The words for them, the default first.
+    pub(super) const WORDS: &'static [(&'static str, PassingOrder)] = &[
+        ("fifo", PassingOrder::Fifo),
+        ("per_point", PassingOrder::PerPoint),
+        ("resequenced", PassingOrder::Resequenced),
+    ];
+}
+
 /// A law of the built-in controllers.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -148,6 +158,12 @@ pub enum EntryRule {
     Viable,
     /// Once it can stop behind it, whatever that one does.
     RoomToStop,
+}
+
+impl LawKind {
+    /// The words for them, the default first.
+    pub(super) const WORDS: &'static [(&'static str, LawKind)] =
+        &[("ocbf", LawKind::Ocbf), ("viable", LawKind::Viable)];
 }
 
 /// An entry road.
@@ -235,4 +251,27 @@ impl Network {
         }
         all.into_iter()
     }
+}
+
+/// An entrance, zone and segment, from which nobody comes out of the network, if there is one that a zone leads to:
+/// all paths from it lead back.
+pub(super) fn entrance_without_way_out(zones: &[Zone]) -> Option<(ZoneId, u32)> {
+    let mut feeders: BTreeMap<(ZoneId, u32), Vec<(ZoneId, u32)>> = BTreeMap::new();
+    let mut found: Vec<(ZoneId, u32)> = Vec::new();
+    for (index, zone) in (0..).zip(zones) {
+        for path in &zone.paths {
+            let entrance = (index, path.segments[0]);
+            match zone.exits[path.exit as usize].to {
+                None => found.push(entrance),
+                Some(to) => feeders.entry((to.zone, to.segment)).or_default().push(entrance),
+            }
+        }
+    }
+    let mut has_way: BTreeSet<(ZoneId, u32)> = BTreeSet::new();
+    while let Some(entrance) = found.pop() {
+        if has_way.insert(entrance) {
+            found.extend(feeders.get(&entrance).into_iter().flatten());
+        }
+    }
+    feeders.into_keys().find(|entrance| !has_way.contains(entrance))
 }

@@ -1,5 +1,6 @@
 //! Parameters of vehicles, controllers and flow policies.
 
+use super::keys;
 use serde::{Deserialize, Serialize};
 
 /// Limits every vehicle obeys, and the distances it keeps.
@@ -183,6 +184,12 @@ pub enum ScheduleKind {
     Tandem,
 }
 
+impl ScheduleKind {
+    /// The words a scenario uses, the default first.
+    pub(super) const WORDS: &'static [(&'static str, ScheduleKind)] =
+        &[("none", ScheduleKind::None), ("pooled", ScheduleKind::Pooled), ("tandem", ScheduleKind::Tandem)];
+}
+
 /// What coordinators do beside assigning duties.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct CoordinationParams {
@@ -197,63 +204,9 @@ pub struct CoordinationParams {
 
 impl CoordinationParams {
     /// No schedules.
-    pub const DEFAULT: CoordinationParams =
-        CoordinationParams { schedule: ScheduleKind::None, price_of_time: 0.7, tandem_weight: 0.3 };
-}
-
-/// Baseline speed v_b of a feedback policy.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Baseline {
-    /// A given speed, m/s.
-    Given(f64),
-    /// The mean, over these entry speeds in m/s, of the terminal speed that minimises the cost.
-    Optimal(Vec<f64>),
-}
-
-/// Which part of the downstream zone a policy observes.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub enum Observed {
-    /// The whole zone: N.
-    Whole,
-    /// Its first metres: N(l).
-    First(f64),
-}
-
-/// How a coordinator sets the terminal speed v_m (paper: `equ:feedback_control`).
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub enum FlowPolicy {
-    /// No flow control: the terminal speed is free.
-    None,
-    /// v_m is constant.
-    Fixed {
-        /// Terminal speed, m/s.
-        terminal_mps: f64,
-    },
-    /// v_m = v_b - k N, with N counted in the downstream zone or its first metres.
-    Feedback {
-        /// Baseline speed v_b.
-        baseline: Baseline,
-        /// Gain k, m/s per vehicle.
-        gain_mps: f64,
-        /// Where vehicles are counted.
-        segment: Observed,
-        /// v_m is not set lower, m/s.
-        min_mps: f64,
-    },
-    /// v_m = mean speed in the first l metres downstream + offset - k N(l); free while it is empty.
-    MeanSpeed {
-        /// Offset on the mean speed, m/s.
-        offset_mps: f64,
-        /// Gain k, m/s per vehicle.
-        gain_mps: f64,
-        /// Length l, m.
-        segment_m: f64,
-        /// v_m is not set lower, m/s.
-        min_mps: f64,
-    },
-    /// v_m minimises the objective that is foretold (paper: Problem 2).
-    Predicted {
-        /// v_m is not set lower, m/s.
-        min_mps: f64,
-    },
+    pub const DEFAULT: CoordinationParams = CoordinationParams {
+        schedule: ScheduleKind::None,
+        price_of_time: keys::PRICE_OF_TIME.default(),
+        tandem_weight: keys::TANDEM_WEIGHT.default(),
+    };
 }

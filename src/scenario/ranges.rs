@@ -69,6 +69,24 @@ pub(super) const HEADWAY: Range = range("a time", 0.0, 1e6, "s");
 /// No run has more steps than this.
 pub(super) const MAX_STEPS: f64 = 1e9;
 
+/// Instants above this are refused: step numbers times nanoseconds stay far within 64 bits.
+pub(super) const MAX_TIME_S: f64 = 1e9;
+
+/// 10 vehicles per second: no lane carries it, and it bounds the work per simulated second.
+pub(super) const MAX_RATE_PER_HOUR: f64 = 36_000.0;
+
+/// Nothing is measured more wrongly than this, in m or m/s.
+pub(super) const MAX_ERROR: f64 = 1e6;
+
+/// No command is later than this, in steps.
+pub(super) const MAX_DELAY: u32 = 1000;
+
+/// No more kinds of vehicles than this.
+pub(super) const MAX_KINDS: usize = 64;
+
+/// No more zones, roads, or paths of a zone than this: frames carry their indices in 16 bits.
+pub(super) const MAX_COUNT: usize = 65_535;
+
 impl Range {
     /// Whether the value is one of them; NaN is not.
     pub fn contains(&self, value: f64) -> bool {

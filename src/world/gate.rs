@@ -104,23 +104,20 @@ impl Gates {
 
     /// Whether the circles that a vehicle on a path may come into have room for it.
     pub(super) fn have_room(&self, zone: ZoneId, path: u32) -> bool {
-        let ahead = self.circles.ahead_of(zone, path);
-        let mut counts = self.in_circles.iter().zip(&self.circles.capacity).enumerate();
-        counts.all(|(bit, (inside, capacity))| ahead >> bit & 1 == 0 || inside < capacity)
+        let Gates { circles, in_circles, .. } = self;
+        circles.ahead_of(zone, path).iter().all(|&c| in_circles[c as usize] < circles.capacity[c as usize])
     }
 
     /// Counts a vehicle that passes from one path to another; before the first and behind the last there is none.
     pub(super) fn pass(&mut self, from: Option<(ZoneId, u32)>, to: Option<(ZoneId, u32)>) {
-        if self.in_circles.is_empty() {
+        let Gates { circles, in_circles, .. } = self;
+        if in_circles.is_empty() {
             return;
         }
         let ahead =
-            |at: Option<(ZoneId, u32)>| at.map_or(0, |(zone, path)| self.circles.ahead_of(zone, path));
-        let (before, after) = (ahead(from), ahead(to));
-        for (bit, inside) in self.in_circles.iter_mut().enumerate() {
-            *inside += after >> bit & 1;
-            *inside -= before >> bit & 1;
-        }
+            |at: Option<(ZoneId, u32)>| at.map_or(&[][..], |(zone, path)| circles.ahead_of(zone, path));
+        ahead(to).iter().for_each(|&circle| in_circles[circle as usize] += 1);
+        ahead(from).iter().for_each(|&circle| in_circles[circle as usize] -= 1);
     }
 
     /// Whether nobody will come any more and nobody waits.

@@ -3,7 +3,7 @@
 use super::car::Car;
 use super::role::World;
 use crate::conflict::{Duties, Duty, DutyKind, Row};
-use crate::scenario::{PassingOrder, Scenario, VehicleParams};
+use crate::scenario::{PassingOrder, Scenario, VehicleParams, ZoneId};
 use crate::shield::{Partner, RESERVE_M, Shield, yielding_slack_m};
 use crate::vehicle::Held;
 use ipc_schemas::Assignment;
@@ -55,8 +55,8 @@ impl Owed {
 #[derive(Debug, Default)]
 pub(super) struct Order {
     known: Vec<u32>,
-    /// What the coordinator has said for the present step.
-    proposed: Option<Vec<u32>>,
+    /// What the coordinator has said last, and for which step: it counts in no other one.
+    proposed: Option<(u64, Vec<u32>)>,
     refused: u32,
 }
 
@@ -85,9 +85,14 @@ impl World {
             let mut ranks: Vec<(u32, u32)> = group.iter().map(|a| (a.rank, a.vehicle)).collect();
             ranks.sort_unstable();
             ranks.dedup();
-            self.orders.entry(zone).or_default().proposed =
-                Some(ranks.into_iter().map(|(_, vehicle)| vehicle).collect());
+            let proposed = ranks.into_iter().map(|(_, vehicle)| vehicle).collect();
+            self.orders.entry(zone).or_default().proposed = Some((self.step, proposed));
         }
+    }
+
+    /// Whether a coordinator has said another order for the present step than the one in force.
+    fn is_reordered(&self, order: &Order) -> bool {
+        order.proposed.as_ref().is_some_and(|(step, proposed)| *step == self.step && *proposed != order.known)
     }
 
     /// Brings the order of a zone that is not served in order of entry up to date: as proposed, if that is an order of
@@ -96,15 +101,19 @@ impl World {
         let first = self.zones[zone].first();
         let members = &self.cars[zone][first..];
         let Order { known, proposed, refused } = self.orders.entry(zone as u32).or_default();
-        known.retain(|vehicle| members.iter().any(|car| car.vehicle == *vehicle));
+        // One that has come back within a step, by a way from the zone to itself, is a newcomer too.
+        known.retain(|vehicle| members.iter().any(|car| car.vehicle == *vehicle && !car.visit.entered));
         for car in members {
             if !known.contains(&car.vehicle) {
                 known.push(car.vehicle);
             }
         }
-        // Of an empty zone nobody says anything new; what was said before means nothing any more.
-        let proposed = proposed.take().filter(|proposed| proposed != known && !known.is_empty());
-        let Some(proposed) = proposed else { return };
+        let Some((step, proposed)) = proposed.take() else { return };
+        // A zone that is told of its neighbours, and has no event itself, may have been spoken of before; since then
+        // its last vehicle may have left, and of an empty zone nothing is said.
+        if step != self.step || proposed == *known {
+            return;
+        }
         let car = |vehicle: u32| members.iter().find(|car| car.vehicle == vehicle);
         let is_whole =
             proposed.len() == known.len() && proposed.iter().all(|vehicle| known.contains(vehicle));
@@ -136,10 +145,18 @@ impl World {
         self.orders.get(&(zone as u32)).map_or(0, |order| order.refused)
     }
 
-    /// Works out who owes what in the zones whose vehicles have changed.
+    /// Works out who owes what in the zones whose vehicles, or whose passing order, have changed.
     pub(super) fn derive_duties(&mut self, scenario: &Scenario) {
         for at in 0..self.events.len() {
             self.derive_in(scenario, self.events[at] as usize);
+        }
+        if self.orders.is_empty() {
+            return;
+        }
+        let reordered = self.orders.iter().filter(|(_, order)| self.is_reordered(order));
+        let reordered: Vec<ZoneId> = reordered.map(|(zone, _)| *zone).collect();
+        for zone in reordered {
+            self.derive_in(scenario, zone as usize);
         }
     }
 

@@ -17,7 +17,7 @@ use crate::scenario::{Scenario, VehicleParams, ZoneId};
 use crate::vehicle::Held;
 use either::Either;
 use ipc_schemas::{self as frames, VehicleState};
-use std::collections::HashMap;
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 use xxhash_rust::xxh3::{Xxh3, xxh3_64_with_seed};
@@ -43,7 +43,7 @@ pub struct World {
     pub(super) owed: Lanes<Owed>,
     pub(super) order: Lanes<u32>,
     /// Of zones that are not served in order of entry.
-    pub(super) orders: HashMap<ZoneId, Order>,
+    pub(super) orders: BTreeMap<ZoneId, Order>,
     pub(super) links: Links,
     /// Parameters by kind of vehicle.
     pub(super) kinds: Vec<VehicleParams>,
@@ -159,7 +159,7 @@ impl World {
             lengths_m,
             owed: Lanes::new(zones),
             order: Lanes::new(zones),
-            orders: HashMap::new(),
+            orders: BTreeMap::new(),
             links: Links::of(network),
             reach_m: kinds.iter().map(|k| k.reaction_time_s * k.v_max_mps).fold(0.0, f64::max),
             longest_m: kinds.iter().map(|k| k.length_m).fold(0.0, f64::max),

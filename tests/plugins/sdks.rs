@@ -84,27 +84,45 @@ fn pauses_and_catches_up(language: &str, command: &str, policy: &str, arguments:
 
 #[test]
 fn python_ocbf_drives_as_the_built_in_law() {
+    drives_as_the_built_in_law(&[], "merge-2", 1);
+}
+
+/// Twelve conflict points, and as many duties per vehicle as it has partners at them.
+#[test]
+fn python_ocbf_drives_the_intersection_as_the_built_in_law() {
+    drives_as_the_built_in_law(&["intersection"], "centre", 0);
+}
+
+fn drives_as_the_built_in_law(arguments: &[&str], target: &str, zone: u32) {
     let Some(python) = python() else { return };
     let folder = tempfile::tempdir().unwrap();
     let trace = folder.path().join("trace.csv");
-    cz().args(["run", "--controller", &format!("merge-2={python} examples/python/ocbf.py")])
+    let controller = format!("{target}={python} examples/python/ocbf.py");
+    let output = cz()
+        .arg("run")
+        .args(arguments)
+        .args(["--json", "-", "--controller", &controller])
         .env("CZ_TRACE", &trace)
         .assert()
-        .success();
+        .success()
+        .get_output()
+        .clone();
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
     let mut seen: HashMap<(u64, u32), (f64, f64)> = HashMap::new();
     for line in std::fs::read_to_string(&trace).unwrap().lines() {
         let cells: Vec<&str> = line.split(',').collect();
         let number = |i: usize| cells[i].parse::<f64>().unwrap();
         seen.insert((number(0) as u64, number(1) as u32), (number(2), number(3)));
     }
-    let mut run = InProcess::new(&Arc::new(load(None, &[], None).unwrap()), 1, 1);
+    let scenario = Arc::new(load(arguments.first().copied(), &[], None).unwrap());
+    let mut run = InProcess::new(&scenario, 1, 1);
     let (mut compared, mut worst) = (0, 0.0_f64);
     loop {
         let step = run.world().step();
-        for s in run.world().records().filter(|s| s.zone == 1 && s.flags & STATE_LEFT == 0) {
+        for s in run.world().records().filter(|s| s.zone == zone && s.flags & STATE_LEFT == 0) {
             // The last state frame ends the run and is not answered, so it is not in the trace.
             let Some((x, v)) = seen.get(&(step, s.vehicle)) else {
-                panic!("step {step}: vehicle {} is not in zone 2 of the other run", s.vehicle);
+                panic!("step {step}: vehicle {} is not in {target} of the other run", s.vehicle);
             };
             worst = worst.max((x - s.x_m).abs()).max((v - s.v_mps).abs());
             compared += 1;
@@ -113,9 +131,15 @@ fn python_ocbf_drives_as_the_built_in_law() {
             break;
         }
     }
-    println!("{compared} vehicle-steps, greatest difference {worst:.2e}");
+    let ours = &run.world().summary().zones[zone as usize];
+    let theirs = summary["zones"][zone as usize]["mean_objective"].as_f64().unwrap();
+    println!(
+        "{target}: {compared} vehicle-steps, greatest difference {worst:.2e}; objective {theirs} and {}",
+        ours.mean_objective
+    );
     assert_eq!(compared, seen.len());
     assert!(worst < 1e-6, "{worst}");
+    assert!((theirs - ours.mean_objective).abs() < 1e-6, "{theirs} and {}", ours.mean_objective);
 }
 
 #[test]

@@ -40,6 +40,9 @@ pub(in crate::app) struct MeasureArgs {
 pub(in crate::app) struct ScaleArgs {
     #[command(flatten)]
     pub measure: MeasureArgs,
+    /// Grids of nine intersections side by side instead of corridors of two merges.
+    #[arg(long, conflicts_with = "with_sumo")]
+    pub grids: bool,
     /// Also measure SUMO's stepping, with its human drivers on the same corridors. Needs the Python package
     /// eclipse-sumo in the Python that CZ_PYTHON names (default: python3).
     #[arg(long)]
@@ -85,6 +88,6 @@ pub(in crate::app) struct PeerScenarioArgs {
 impl PeerScenarioArgs {
     pub fn load(&self) -> Result<Scenario, ScenarioError> {
         let (seed, set) = (self.seed, self.set.clone());
-        ScenarioArgs { scenario: None, seed, set, corridors: None }.load()
+        ScenarioArgs { scenario: None, seed, set, side_by_side: None }.load()
     }
 }

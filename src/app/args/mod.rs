@@ -14,7 +14,7 @@ use clap::{Args, Parser, Subcommand};
 pub(super) use conduct::{ConductArgs, Restart, ShareArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
 pub(super) use run::{KeepArgs, PartArgs, RunArgs, SupervisedArgs, WorldArgs};
-pub(super) use scenario::ScenarioArgs;
+pub(super) use scenario::{ScenarioArgs, SideBySide};
 use std::ffi::OsString;
 use std::path::PathBuf;
 

@@ -8,8 +8,8 @@ mod life;
 
 use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs};
 use super::lines::{PartLine, WorldLine};
+use super::progress::{Bar, Position};
 use super::record::Recording;
-use super::run::{Bar, Position};
 use super::say::Crier;
 use super::{AppError, record};
 use crate::lockstep::RefusedFrames;

@@ -2,6 +2,8 @@
 
 use super::error::{Place, ScenarioError, nearest};
 use super::table::{Field, Table};
+use crate::scenario::keys;
+use crate::scenario::ranges::{MAX_RATE_PER_HOUR, MAX_TIME_S};
 use crate::scenario::{
     Arrival, Demand, Poisson, RatePeriod, Route, SpeedDistribution, VehicleParams, ranges,
 };
@@ -9,10 +11,6 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::rc::Rc;
 
-/// Instants above this are refused: step numbers times nanoseconds stay far within 64 bits.
-pub(in crate::scenario) const MAX_TIME_S: f64 = 1e9;
-/// 10 vehicles per second: no lane carries it, and it bounds the work per simulated second.
-pub(in crate::scenario) const MAX_RATE_PER_HOUR: f64 = 36_000.0;
 const HEADER: &str = "time_s,road,speed_mps";
 /// A trace may say which of its road's routes a vehicle takes.
 const HEADER_WITH_ROUTES: &str = "time_s,road,speed_mps,route";
@@ -44,13 +42,12 @@ impl DemandReader<'_> {
         const EXPECTED: &str =
             "a table with trace = \"FILE.csv\", or with rates and the other keys of random arrivals";
         const OTHER_SEEDS: &str = "trace and rates, where trace_seeds lists the seeds that have a trace";
-        const POISSON: [&str; 6] =
-            ["rates", "min_headway_s", "speed_mean_mps", "speed_sd_mps", "speed_min_mps", "speed_max_mps"];
+        let random = keys::names(keys::RANDOM);
         let mut t = table.need("demand", EXPECTED)?.table(EXPECTED)?;
-        t.only(&[&["trace", "trace_seeds"][..], &POISSON].concat())?;
+        t.only(&[&keys::names(keys::TRACE)[..], &random].concat())?;
         if let Some(seeds) = t.get("trace_seeds") {
             let (trace, rates) = (t.need("trace", OTHER_SEEDS)?, t.need("rates", OTHER_SEEDS)?);
-            let random_is_set = POISSON.iter().any(|key| t.get(key).is_some_and(|field| field.is_set()));
+            let random_is_set = random.iter().any(|key| t.get(key).is_some_and(|field| field.is_set()));
             // Whoever sets one of the two by hand means that one, whatever the seed.
             let takes_trace = match (trace.is_set(), random_is_set) {
                 (true, false) if !seeds.is_set() => true,
@@ -69,11 +66,11 @@ impl DemandReader<'_> {
                 Err(rates.bad_because(Some("trace is given as well".into()), "either trace or rates"))
             }
             (Some(trace), None) => {
-                t.only_or_stale(&["trace"], if trace.is_set() { &POISSON } else { &[] })?;
+                t.only_or_stale(&["trace"], if trace.is_set() { &random[..] } else { &[] })?;
                 self.trace(road, &trace)
             }
             (None, Some(rates)) => {
-                t.only_or_stale(&POISSON, &["trace"])?;
+                t.only_or_stale(&random, &["trace"])?;
                 t.blame(&rates);
                 self.poisson(&t, &rates)
             }

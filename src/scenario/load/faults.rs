@@ -1,20 +1,15 @@
 //! `[faults]`: what goes wrong on purpose.
 
-use super::MAX_TIME_S;
 use super::error::ScenarioError;
 use super::scope;
 use super::table::Table;
+use crate::scenario::ranges::{MAX_DELAY, MAX_ERROR, MAX_TIME_S};
 use crate::scenario::{CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall, Zone};
-
-/// Nothing is measured more wrongly than this, in m or m/s.
-pub(in crate::scenario) const MAX_ERROR: f64 = 1e6;
-/// No command is later than this, in steps.
-pub(in crate::scenario) const MAX_DELAY: u32 = 1000;
 
 /// Reads `[faults]`; an empty table is none.
 pub(super) fn read(table: Option<&Table<'_>>, zones: &[Zone]) -> Result<Option<Faults>, ScenarioError> {
     let Some(t) = table else { return Ok(None) };
-    t.only(&["noise", "sensors", "commands", "stalls"])?;
+    t.only_declared(crate::scenario::keys::FAULTS)?;
     let mut faults = Faults::default();
     if let Some(field) = t.get("noise") {
         faults.noise = Some(noise(&field.table("a table such as {position_sd_m = 0.5}")?)?);

@@ -16,9 +16,9 @@ pub(super) fn read(root: &Table<'_>, zones: &[Zone]) -> Result<Vec<Plugin>, Scen
     }
     let tables = root.tables("controllers", EXPECTED)?;
     for table in &tables {
-        table.only(&["name", "zones", "paths", "command"])?;
+        table.only_declared(crate::scenario::keys::CONTROLLERS)?;
     }
-    let names = super::topology::unique_names(&tables, "controller")?;
+    let names = super::table::unique_names(&tables, "controller")?;
     let mut plugins: Vec<Plugin> = Vec::with_capacity(tables.len());
     for (table, name) in tables.iter().zip(names) {
         if plugins.len() == MAX_PLUGINS {

@@ -1,9 +1,9 @@
 //! `roads.*.routes`: which ways the vehicles of a road may take.
 
 use super::error::ScenarioError;
-use super::table::Table;
-use super::topology::unique_names;
-use crate::scenario::{Route, Zone, ranges};
+use super::table::{Table, unique_names};
+
+use crate::scenario::{Route, Zone, keys};
 
 /// Reads the routes of a road that leads to `(zone, entrance)`; none when it does not name any.
 pub(super) fn read(table: &Table<'_>, zones: &[Zone], end: (u32, u32)) -> Result<Vec<Route>, ScenarioError> {
@@ -22,7 +22,7 @@ fn route(
     zones: &[Zone],
     (zone, segment): (u32, u32),
 ) -> Result<Route, ScenarioError> {
-    t.only(&["name", "paths", "share"])?;
+    t.only_declared(keys::ROUTES)?;
     const PATHS: &str = "a list of paths in the order in which they are driven, each as \"ZONE.PATH\"";
     let mut next = Some((zone, segment));
     let mut paths = Vec::new();
@@ -46,6 +46,6 @@ fn route(
         paths.push(*path);
         next = here.exit_of(*path).to.map(|to| (to.zone, to.segment));
     }
-    let share = t.within_or("share", 1.0, &ranges::SHARE)?;
+    let share = t.number_or(&keys::SHARE, keys::SHARE.default())?;
     Ok(Route { name: name.to_owned(), paths, share })
 }

@@ -2,11 +2,12 @@
 
 use super::document::{Document, Node, Origin, Value};
 use super::error::{Place, ScenarioError, nearest, printable};
-use crate::scenario::ranges::Range;
+use crate::scenario::keys::{self, Choice, Flag, Keys, Number};
+use crate::scenario::ranges::{MAX_COUNT, Range};
 use std::collections::BTreeMap;
 
 /// A table being read.
-pub(super) struct Table<'a> {
+pub(in crate::scenario) struct Table<'a> {
     document: &'a Document,
     path: String,
     origin: Origin,
@@ -15,10 +16,10 @@ pub(super) struct Table<'a> {
 
 /// A value being read.
 #[derive(Clone)]
-pub(super) struct Field<'a> {
+pub(in crate::scenario) struct Field<'a> {
     document: &'a Document,
     /// Dotted path.
-    pub(super) path: String,
+    pub(in crate::scenario) path: String,
     node: &'a Node,
 }
 
@@ -32,7 +33,7 @@ impl<'a> Table<'a> {
     }
 
     /// All entries, in order of key.
-    pub(super) fn entries(&self) -> impl Iterator<Item = (&'a str, Field<'a>)> + '_ {
+    pub(in crate::scenario) fn entries(&self) -> impl Iterator<Item = (&'a str, Field<'a>)> + '_ {
         self.entries
             .iter()
             .map(|(key, node)| (key.as_str(), Field { document: self.document, path: self.key(key), node }))
@@ -40,7 +41,7 @@ impl<'a> Table<'a> {
 
     /// Refuses keys other than these. Called first, so that a misspelt key is reported as such and not as a
     /// missing one. Of several, the first one in the file.
-    pub(super) fn only(&self, known: &[&str]) -> Result<(), ScenarioError> {
+    pub(in crate::scenario) fn only(&self, known: &[&str]) -> Result<(), ScenarioError> {
         self.only_or_stale(known, &[])
     }
 
@@ -48,7 +49,11 @@ impl<'a> Table<'a> {
     ///
     /// A table may be one of several variants. Where a `--set` selects another variant than the file's, the
     /// keys the file gave for its own variant are left without meaning, which is no mistake of the user's.
-    pub(super) fn only_or_stale(&self, known: &[&str], stale: &[&str]) -> Result<(), ScenarioError> {
+    pub(in crate::scenario) fn only_or_stale(
+        &self,
+        known: &[&str],
+        stale: &[&str],
+    ) -> Result<(), ScenarioError> {
         let unknown = self.entries.iter().filter(|(key, node)| {
             let is_stale = stale.contains(&key.as_str()) && matches!(node.origin, Origin::Line(_));
             !known.contains(&key.as_str()) && !is_stale
@@ -72,29 +77,34 @@ impl<'a> Table<'a> {
         }
     }
 
+    /// Refuses keys other than those declared.
+    pub(in crate::scenario) fn only_declared(&self, keys: Keys) -> Result<(), ScenarioError> {
+        self.only(&keys::names(keys))
+    }
+
     /// Where the table starts.
-    pub(super) fn place(&self) -> Place {
+    pub(in crate::scenario) fn place(&self) -> Place {
         self.document.place(self.origin)
     }
 
     /// Dotted path of a key of this table.
-    pub(super) fn key(&self, key: &str) -> String {
+    pub(in crate::scenario) fn key(&self, key: &str) -> String {
         let key = printable(key);
         if self.path.is_empty() { key } else { format!("{}.{key}", self.path) }
     }
 
     /// A key that may be absent.
-    pub(super) fn get(&self, key: &str) -> Option<Field<'a>> {
+    pub(in crate::scenario) fn get(&self, key: &str) -> Option<Field<'a>> {
         let node = self.entries.get(key)?;
         Some(Field { document: self.document, path: self.key(key), node })
     }
 
     /// A key that must be there.
-    pub(super) fn need(&self, key: &str, expected: &str) -> Result<Field<'a>, ScenarioError> {
+    pub(in crate::scenario) fn need(&self, key: &str, expected: &str) -> Result<Field<'a>, ScenarioError> {
         self.get(key).ok_or_else(|| self.missing(key, expected))
     }
 
-    pub(super) fn missing(&self, key: &str, expected: &str) -> ScenarioError {
+    pub(in crate::scenario) fn missing(&self, key: &str, expected: &str) -> ScenarioError {
         ScenarioError::MissingKey {
             place: self.place(),
             key: self.key(key).into(),
@@ -103,7 +113,7 @@ impl<'a> Table<'a> {
     }
 
     /// Two keys of which a table has one. A `--set` of one replaces the file's other.
-    pub(super) fn either(&self, a: &str, b: &str) -> (Option<Field<'a>>, Option<Field<'a>>) {
+    pub(in crate::scenario) fn either(&self, a: &str, b: &str) -> (Option<Field<'a>>, Option<Field<'a>>) {
         match (self.get(a), self.get(b)) {
             (Some(a), Some(b)) if a.is_set() && !b.is_set() => (Some(a), None),
             (Some(a), Some(b)) if b.is_set() && !a.is_set() => (None, Some(b)),
@@ -112,14 +122,14 @@ impl<'a> Table<'a> {
     }
 
     /// Keys found missing from here on are missing because of this field, if it is a `--set`.
-    pub(super) fn blame(&mut self, field: &Field<'_>) {
+    pub(in crate::scenario) fn blame(&mut self, field: &Field<'_>) {
         if field.is_set() {
             self.origin = field.node.origin;
         }
     }
 
     /// A number that must be there.
-    pub(super) fn f64(
+    pub(in crate::scenario) fn f64(
         &self,
         key: &str,
         ok: impl Fn(f64) -> bool,
@@ -129,7 +139,7 @@ impl<'a> Table<'a> {
     }
 
     /// A number with a default. The default, too, must be within the range, which may depend on other keys.
-    pub(super) fn f64_or(
+    pub(in crate::scenario) fn f64_or(
         &self,
         key: &str,
         default: f64,
@@ -143,18 +153,43 @@ impl<'a> Table<'a> {
         }
     }
 
+    /// The number of a declared key, which must be there.
+    pub(in crate::scenario) fn number(&self, key: &Number) -> Result<f64, ScenarioError> {
+        self.within(key.name, &key.range)
+    }
+
+    /// The number of a declared key, or another.
+    pub(in crate::scenario) fn number_or(&self, key: &Number, default: f64) -> Result<f64, ScenarioError> {
+        self.within_or(key.name, default, &key.range)
+    }
+
+    /// The word of a declared key, or its first.
+    pub(in crate::scenario) fn chosen<T: Copy>(&self, key: &Choice<T>) -> Result<T, ScenarioError> {
+        self.choice_or_first(key.name, key.words)
+    }
+
+    /// `true` or `false`, or the key's default.
+    pub(in crate::scenario) fn flag(&self, key: &Flag) -> Result<bool, ScenarioError> {
+        self.bool_or(key.name, key.default)
+    }
+
     /// A number within a range.
-    pub(super) fn within(&self, key: &str, range: &Range) -> Result<f64, ScenarioError> {
+    pub(in crate::scenario) fn within(&self, key: &str, range: &Range) -> Result<f64, ScenarioError> {
         self.need(key, &range.to_string())?.within(range)
     }
 
     /// The same, with a default.
-    pub(super) fn within_or(&self, key: &str, default: f64, range: &Range) -> Result<f64, ScenarioError> {
+    pub(in crate::scenario) fn within_or(
+        &self,
+        key: &str,
+        default: f64,
+        range: &Range,
+    ) -> Result<f64, ScenarioError> {
         self.f64_or(key, default, |value| range.contains(value), &range.to_string())
     }
 
     /// `true` or `false`, with a default.
-    pub(super) fn bool_or(&self, key: &str, default: bool) -> Result<bool, ScenarioError> {
+    pub(in crate::scenario) fn bool_or(&self, key: &str, default: bool) -> Result<bool, ScenarioError> {
         match self.get(key) {
             None => Ok(default),
             Some(field) => match field.node.value {
@@ -165,7 +200,7 @@ impl<'a> Table<'a> {
     }
 
     /// One of some words, with the first as default.
-    pub(super) fn choice_or_first<T: Copy>(
+    pub(in crate::scenario) fn choice_or_first<T: Copy>(
         &self,
         key: &str,
         choices: &[(&str, T)],
@@ -177,12 +212,16 @@ impl<'a> Table<'a> {
     }
 
     /// A name that must be there.
-    pub(super) fn name(&self) -> Result<&'a str, ScenarioError> {
+    pub(in crate::scenario) fn name(&self) -> Result<&'a str, ScenarioError> {
         self.need("name", EXPECTED_NAME)?.word()
     }
 
     /// The tables of an array of tables that must be there and not empty.
-    pub(super) fn tables(&self, key: &str, expected: &str) -> Result<Vec<Table<'a>>, ScenarioError> {
+    pub(in crate::scenario) fn tables(
+        &self,
+        key: &str,
+        expected: &str,
+    ) -> Result<Vec<Table<'a>>, ScenarioError> {
         let items = self.need(key, expected)?.items(expected)?;
         items.iter().map(|item| item.table(expected)).collect()
     }
@@ -192,7 +231,7 @@ const EXPECTED_NAME: &str = "a name of 1 to 64 letters, digits, '_' or '-'";
 
 impl<'a> Field<'a> {
     /// A string that may be a name.
-    pub(super) fn word(&self) -> Result<&'a str, ScenarioError> {
+    pub(in crate::scenario) fn word(&self) -> Result<&'a str, ScenarioError> {
         let name = self.str(EXPECTED_NAME)?;
         let allowed = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
         if name.is_empty() || name.len() > 64 || !name.chars().all(allowed) {
@@ -202,12 +241,12 @@ impl<'a> Field<'a> {
     }
 
     /// The error for a value that is not what was expected.
-    pub(super) fn bad(&self, expected: &str) -> ScenarioError {
+    pub(in crate::scenario) fn bad(&self, expected: &str) -> ScenarioError {
         self.bad_because(None, expected)
     }
 
     /// The same, with what is wrong in words.
-    pub(super) fn bad_because(&self, problem: Option<String>, expected: &str) -> ScenarioError {
+    pub(in crate::scenario) fn bad_because(&self, problem: Option<String>, expected: &str) -> ScenarioError {
         ScenarioError::BadValue {
             place: self.place(),
             key: self.path.as_str().into(),
@@ -218,22 +257,26 @@ impl<'a> Field<'a> {
     }
 
     /// Where the value is written.
-    pub(super) fn place(&self) -> Place {
+    pub(in crate::scenario) fn place(&self) -> Place {
         self.document.place(self.node.origin)
     }
 
     /// The value, as messages show it.
-    pub(super) fn found(&self) -> String {
+    pub(in crate::scenario) fn found(&self) -> String {
         self.node.value.to_string()
     }
 
     /// Whether the value comes from a `--set`.
-    pub(super) fn is_set(&self) -> bool {
+    pub(in crate::scenario) fn is_set(&self) -> bool {
         matches!(self.node.origin, Origin::Set(_))
     }
 
     /// A finite number within a range.
-    pub(super) fn f64(&self, ok: impl Fn(f64) -> bool, expected: &str) -> Result<f64, ScenarioError> {
+    pub(in crate::scenario) fn f64(
+        &self,
+        ok: impl Fn(f64) -> bool,
+        expected: &str,
+    ) -> Result<f64, ScenarioError> {
         let number = match self.node.value {
             Value::Integer(i) => i as f64,
             Value::Float(x) => x,
@@ -243,12 +286,16 @@ impl<'a> Field<'a> {
     }
 
     /// The same.
-    pub(super) fn within(&self, range: &Range) -> Result<f64, ScenarioError> {
+    pub(in crate::scenario) fn within(&self, range: &Range) -> Result<f64, ScenarioError> {
         self.f64(|value| range.contains(value), &range.to_string())
     }
 
     /// An integer within a range.
-    pub(super) fn integer<T: TryFrom<i128>>(&self, least: i128, expected: &str) -> Result<T, ScenarioError> {
+    pub(in crate::scenario) fn integer<T: TryFrom<i128>>(
+        &self,
+        least: i128,
+        expected: &str,
+    ) -> Result<T, ScenarioError> {
         match self.node.value {
             Value::Integer(i) if i >= least => T::try_from(i).map_err(|_| self.bad(expected)),
             _ => Err(self.bad(expected)),
@@ -256,7 +303,7 @@ impl<'a> Field<'a> {
     }
 
     /// A string.
-    pub(super) fn str(&self, expected: &str) -> Result<&'a str, ScenarioError> {
+    pub(in crate::scenario) fn str(&self, expected: &str) -> Result<&'a str, ScenarioError> {
         match &self.node.value {
             Value::String(s) => Ok(s),
             _ => Err(self.bad(expected)),
@@ -264,7 +311,7 @@ impl<'a> Field<'a> {
     }
 
     /// One of some words.
-    pub(super) fn choice<T: Copy>(&self, choices: &[(&str, T)]) -> Result<T, ScenarioError> {
+    pub(in crate::scenario) fn choice<T: Copy>(&self, choices: &[(&str, T)]) -> Result<T, ScenarioError> {
         let word = match &self.node.value {
             Value::String(s) => s.as_str(),
             _ => "",
@@ -276,7 +323,7 @@ impl<'a> Field<'a> {
     }
 
     /// A table.
-    pub(super) fn table(&self, expected: &str) -> Result<Table<'a>, ScenarioError> {
+    pub(in crate::scenario) fn table(&self, expected: &str) -> Result<Table<'a>, ScenarioError> {
         match &self.node.value {
             Value::Table(entries) => Ok(Table {
                 document: self.document,
@@ -289,7 +336,7 @@ impl<'a> Field<'a> {
     }
 
     /// The elements of an array that is not empty. Their paths use names where they have one.
-    pub(super) fn items(&self, expected: &str) -> Result<Vec<Field<'a>>, ScenarioError> {
+    pub(in crate::scenario) fn items(&self, expected: &str) -> Result<Vec<Field<'a>>, ScenarioError> {
         match &self.node.value {
             Value::Array(items) if !items.is_empty() => Ok(items
                 .iter()
@@ -306,4 +353,27 @@ impl<'a> Field<'a> {
             _ => Err(self.bad(expected)),
         }
     }
+}
+
+/// Reads the names of an array of tables, which must be unique.
+pub(in crate::scenario) fn unique_names<'a>(
+    tables: &[Table<'a>],
+    what: &str,
+) -> Result<Vec<&'a str>, ScenarioError> {
+    let mut seen = std::collections::BTreeSet::new();
+    let mut names = Vec::with_capacity(tables.len());
+    for table in tables {
+        let name = table.name()?;
+        if !seen.insert(name) {
+            let expected = format!("a name no other {what} has");
+            return Err(table.need("name", &expected)?.bad_because(Some("used twice".into()), &expected));
+        }
+        names.push(name);
+    }
+    if names.len() > MAX_COUNT {
+        let table = &tables[MAX_COUNT];
+        let expected = format!("at most {MAX_COUNT} {what} entries");
+        return Err(table.need("name", &expected)?.bad_because(Some("too many".into()), &expected));
+    }
+    Ok(names)
 }

@@ -2,13 +2,11 @@
 
 use super::error::{ScenarioError, nearest};
 use super::sections;
-use super::table::{Field, Table};
+use super::table::{Field, Table, unique_names};
+use crate::scenario::network::entrance_without_way_out;
 use crate::scenario::{
-    Crossing, Downstream, Exit, FlowPolicy, LawKind, PassingOrder, Path, Segment, Source, Zone, ranges,
+    Crossing, Downstream, Exit, FlowPolicy, LawKind, PassingOrder, Path, Segment, Source, Zone, keys, ranges,
 };
-
-/// No more zones, roads, or paths of a zone than this: frames carry their indices in 16 bits.
-pub(in crate::scenario) const MAX_COUNT: usize = 65_535;
 
 /// Name of the one exit of a zone in the short form.
 const ONLY_EXIT: &str = "exit";
@@ -22,30 +20,6 @@ pub(super) struct Topology {
     /// Zone and entrance each road leads to.
     pub(super) road_ends: Vec<(u32, u32)>,
 }
-
-/// Reads the names of an array of tables, which must be unique.
-pub(super) fn unique_names<'a>(tables: &[Table<'a>], what: &str) -> Result<Vec<&'a str>, ScenarioError> {
-    let mut seen = std::collections::BTreeSet::new();
-    let mut names = Vec::with_capacity(tables.len());
-    for table in tables {
-        let name = table.name()?;
-        if !seen.insert(name) {
-            let expected = format!("a name no other {what} has");
-            return Err(table.need("name", &expected)?.bad_because(Some("used twice".into()), &expected));
-        }
-        names.push(name);
-    }
-    if names.len() > MAX_COUNT {
-        let table = &tables[MAX_COUNT];
-        let expected = format!("at most {MAX_COUNT} {what} entries");
-        return Err(table.need("name", &expected)?.bad_because(Some("too many".into()), &expected));
-    }
-    Ok(names)
-}
-
-/// The keys of a zone's table.
-pub(super) const ZONE_KEYS: [&str; 9] =
-    ["name", "flow", "approaches", "segments", "paths", "exits", "crossings", "order", "law"];
 
 /// Reads all zones; `step_m` is the farthest a vehicle may go in one step.
 pub(super) fn read(
@@ -110,7 +84,15 @@ pub(super) fn read(
         }
     }
     let mut slots: Vec<Option<Zone>> = sorted_zones.into_iter().map(Some).collect();
-    let zones = declared.iter().map(|&old| slots[old].take().expect("each zone is sorted once")).collect();
+    let zones: Vec<Zone> =
+        declared.iter().map(|&old| slots[old].take().expect("each zone is sorted once")).collect();
+    if let Some(trap) = entrance_without_way_out(&zones) {
+        let leads_there = |claim: &&Claim<'_>| (sorted[claim.to.zone as usize], claim.to.segment) == trap;
+        let claim = claims.exits.iter().flatten().flatten().find(leads_there);
+        let problem = Some("nobody who comes in here leaves the network again".to_owned());
+        let field = &claim.expect("an exit leads to the entrance").field;
+        return Err(field.bad_because(problem, "an entrance with a path that leads out in the end"));
+    }
     let road_ends = road_ends.into_iter().map(|(zone, segment)| (sorted[zone as usize], segment)).collect();
     Ok(Topology { zones, declared, road_ends })
 }
@@ -167,7 +149,7 @@ fn short<'a>(table: &Table<'a>, mut zone: Zone, step_m: f64) -> Result<Shape<'a>
     let names = unique_names(&tables, "approach of the zone")?;
     let (is_length, expected) = whole_length(step_m);
     for (index, (t, name)) in tables.iter().zip(names).enumerate() {
-        t.only(&["name", "length_m", "road", "zone", "exit", "link_m", "link_speed_mps"])?;
+        t.only_declared(keys::APPROACHES)?;
         let length_m = t.f64("length_m", &is_length, &expected)?;
         let name = name.to_owned();
         zone.segments.push(Segment { name: name.clone(), length_m, source: None, shape: Vec::new() });
@@ -187,7 +169,7 @@ fn full<'a>(table: &Table<'a>, mut zone: Zone, step_m: f64) -> Result<Shape<'a>,
     if table.get("exits").is_some() {
         let exits = table.tables("exits", "a list of exits, at least one")?;
         for (t, name) in exits.iter().zip(unique_names(&exits, "exit of the zone")?) {
-            t.only(&["name", "flow"])?;
+            t.only_declared(keys::EXITS)?;
             zone.exits.push(Exit { name: name.to_owned(), to: None, flow: FlowPolicy::None });
         }
     }
@@ -197,7 +179,7 @@ fn full<'a>(table: &Table<'a>, mut zone: Zone, step_m: f64) -> Result<Shape<'a>,
     let mut is_used = vec![false; segments.len()];
     let (is_length, expected_length) = whole_length(step_m);
     for (t, name) in paths.iter().zip(&path_names) {
-        t.only(&["name", "segments", "exit", "share"])?;
+        t.only_declared(keys::PATHS)?;
         const SEGMENTS: &str = "a list of segment names from an entrance to an exit";
         let mut own: Vec<u32> = Vec::new();
         for item in t.need("segments", SEGMENTS)?.items(SEGMENTS)? {
@@ -246,7 +228,7 @@ fn full<'a>(table: &Table<'a>, mut zone: Zone, step_m: f64) -> Result<Shape<'a>,
                 }
             }
         };
-        let share = t.within_or("share", 1.0, &ranges::SHARE)?;
+        let share = t.number_or(&keys::SHARE, keys::SHARE.default())?;
         zone.paths.push(Path { name: (*name).to_owned(), segments: own, exit: exit as u32, length_m, share });
     }
     if let Some(unused) = is_used.iter().position(|used| !used) {
@@ -279,7 +261,7 @@ fn is_entrance(segment: &Table<'_>) -> bool {
 }
 
 fn segment(t: &Table<'_>, name: &str) -> Result<Segment, ScenarioError> {
-    t.only(&["name", "length_m", "shape", "road", "zone", "exit", "link_m", "link_speed_mps"])?;
+    t.only_declared(keys::SEGMENTS)?;
     let mut shape: Vec<[f64; 2]> = Vec::new();
     if let Some(field) = t.get("shape") {
         const SHAPE: &str = "a list of at least two points [x, y], in m, each within 1e7 m of the origin";
@@ -314,7 +296,7 @@ fn crossing(
     zone: &Zone,
     segment_names: &[&str],
 ) -> Result<Crossing, ScenarioError> {
-    t.only(&["name", "length_m", "at"])?;
+    t.only_declared(keys::CROSSINGS)?;
     const AT: &str = "a table of places such as {north = 12.5, west = 8}, at least two";
     let length_m = t.within("length_m", &ranges::CROSSING_LENGTH)?;
     let field = t.need("at", AT)?;
@@ -573,6 +555,29 @@ mod tests {
             let entrance = &n.zones[road.zone as usize].segments[road.segment as usize];
             assert_eq!(entrance.source, Some(Source::Road(index as u32)));
         }
+    }
+
+    #[test]
+    fn an_entrance_from_which_nobody_comes_out_is_refused() {
+        let text = "name = \"n\"\nobjective = { beta = 1 }\n[[zones]]\nname = \"z\"\nsegments = [\n\
+             { name = \"in\", length_m = 100, road = \"r\" },\n\
+             { name = \"again\", length_m = 100, zone = \"z\", exit = \"back\" },\n]\npaths = [\n\
+             { name = \"a\", segments = [\"in\"], exit = \"out\" },\n\
+             { name = \"b\", segments = [\"in\"], exit = \"back\" },\n\
+             { name = \"c\", segments = [\"again\"], exit = \"EXIT\" },\n]\n[[roads]]\nname = \"r\"\n\
+             [roads.demand]\nrates = [{ until_s = 1, vehicles_per_hour = 1 }]\nmin_headway_s = 1\n\
+             speed_mean_mps = 9\nspeed_sd_mps = 1\nspeed_min_mps = 8\nspeed_max_mps = 10\n";
+        let load = |exit| load_text("n.toml", &text.replace("EXIT", exit), TraceBase::Embedded, &[], None);
+        let refused = load("back").unwrap_err().to_string();
+        assert_eq!(
+            refused,
+            "n.toml:7: zones.z.segments.again.zone = \"z\": nobody who comes in here leaves the network again; expected \
+             an entrance with a path that leads out in the end"
+        );
+        let mut sound = load("out").unwrap();
+        assert_eq!(sound.check(), Ok(()));
+        sound.network.zones[0].paths[2].exit = sound.network.zones[0].paths[1].exit;
+        assert!(sound.check().is_err());
     }
 
     #[test]

@@ -10,7 +10,6 @@
 //! What a stranger writes to a word can make a sleep end early, or last for as long as the sleeper allows
 //! itself, and no more. One who may shorten the file may shorten the frames too, and end each process.
 
-use super::space::{RunSpace, SpaceError, failed};
 use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
 use ipc_schemas::Role;
 use memmap2::MmapRaw;
@@ -62,7 +61,7 @@ pub fn monotonic_ns() -> u64 {
 
 impl Bells {
     /// Creates the file, which must not exist, and maps it.
-    fn create(path: &std::path::Path) -> std::io::Result<Bells> {
+    pub(super) fn create(path: &std::path::Path) -> std::io::Result<Bells> {
         let mut options = std::fs::OpenOptions::new();
         let file = options.read(true).write(true).create_new(true).mode(0o600).open(path)?;
         file.set_len(BYTES as u64)?;
@@ -70,7 +69,7 @@ impl Bells {
     }
 
     /// Maps a file that another process of the run has created.
-    fn open(path: &std::path::Path) -> std::io::Result<Bells> {
+    pub(super) fn open(path: &std::path::Path) -> std::io::Result<Bells> {
         let no_links = rustix::fs::OFlags::NOFOLLOW.bits() as i32;
         let file = std::fs::OpenOptions::new().read(true).write(true).custom_flags(no_links).open(path)?;
         Bells::map(&file)
@@ -174,26 +173,6 @@ pub fn ring_all(ropes: &[BellRope]) {
     if !ropes.is_empty() {
         fence(Ordering::SeqCst);
         ropes.iter().for_each(BellRope::ring_after_fence);
-    }
-}
-
-impl RunSpace {
-    /// Creates the bells of a run, as its world: the only one, which its services have shown.
-    pub fn create_bells(&self) -> Result<Bells, SpaceError> {
-        let path = &self.bells_path;
-        // What a killed world has left.
-        let _ = std::fs::remove_file(path);
-        Bells::create(path).map_err(|e| failed(&format!("create {}", path.display()), &e))
-    }
-
-    /// The bells of a run whose world has created its services.
-    pub fn bells(&self) -> Result<Bells, SpaceError> {
-        let path = &self.bells_path;
-        Bells::open(path).map_err(|e| match e.kind() {
-            // A world that has just begun makes them in a moment.
-            std::io::ErrorKind::NotFound => SpaceError::NoService { service: "bells".to_owned() },
-            _ => failed(&format!("use {}", path.display()), &e),
-        })
     }
 }
 

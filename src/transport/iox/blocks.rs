@@ -1,7 +1,8 @@
 //! Blocks of bytes for whoever looks on: a service that overflows, so that nobody waits for a reader, or one
 //! that says when it is full.
 
-use super::space::{RunSpace, SpaceError, failed, service_name};
+use super::error::{SpaceError, failed};
+use super::space::{RunSpace, service_name};
 use crate::transport::TransportError;
 use iceoryx2::port::BackpressureAction;
 use iceoryx2::port::publisher::Publisher;

@@ -3,11 +3,10 @@
 //! Whether a run is dead is told by its locks, so that what is removed is not looked into: files that were
 //! cut short or written over hold nobody up. What is not known for ours is left alone.
 
+use super::error::{SHARED_MEMORY, SpaceError};
 use super::place::{
-    Base, Found, SHARED_MEMORY, file_name, is_abandoned, is_directory, own_entries,
-    prefixes_in_shared_memory, shared_memory,
+    Base, Found, file_name, is_abandoned, is_directory, own_entries, prefixes_in_shared_memory, shared_memory,
 };
-use super::space::SpaceError;
 use std::path::{Path, PathBuf};
 
 /// What was found of one run, or of one measurement.

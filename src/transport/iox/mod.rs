@@ -2,7 +2,9 @@
 
 mod bell;
 mod blocks;
+mod error;
 mod leftovers;
+mod name;
 mod place;
 mod ports;
 mod space;
@@ -10,8 +12,8 @@ mod watchdog;
 
 pub use bell::{Bell, BellRope, Bells, monotonic_ns};
 pub use blocks::{Block, BlockInbox, BlockOutbox};
+pub use error::SpaceError;
 pub use leftovers::{Condition, Leftover, clean, sweep_dead_runs};
+pub use name::{RunName, RunNameError};
 pub use ports::{IoxFrame, IoxInbox, IoxLoan, IoxOutbox};
-pub use space::{
-    AttachDesk, AttachLine, ReplyFrame, RunName, RunNameError, RunSpace, Service, ServiceLimits, SpaceError,
-};
+pub use space::{AttachDesk, AttachLine, ReplyFrame, RunSpace, Service, ServiceLimits};

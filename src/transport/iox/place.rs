@@ -10,7 +10,8 @@
 //! read that a hostile process may have written. Coming, going and sweeping happen under a lock on the
 //! directory of all runs.
 
-use super::space::{RunName, SpaceError, failed};
+use super::error::{SHARED_MEMORY, SpaceError, failed};
+use super::name::RunName;
 use rustix::fs::{
     AtFlags, CWD, FileType, FlockOperation, Mode, OFlags, Stat, flock, fstat, mkdirat, openat, renameat,
     statat, unlinkat,
@@ -28,8 +29,6 @@ const MARKER: &str = ".cz-run";
 const DAMAGED: &str = "damaged";
 /// A run's directory before its marker is in it; there is one at most, under the lock.
 const BEGINNING: &str = ".cz-begins";
-/// Where shared memory has its files.
-pub(super) const SHARED_MEMORY: &str = "/dev/shm";
 /// What the file in shared memory is called whose lock says that a run lives.
 const LOCK: &str = "lock";
 /// Names that are tried for the directory of all runs while somebody else has taken those before.

@@ -3,9 +3,11 @@
 //! A run has a directory of its own and a file-name prefix of its own (`place`). Whoever leaves last removes
 //! both, including the one global file iceoryx2 leaves behind.
 
-use super::bell::BellRope;
+use super::bell::{BellRope, Bells};
+use super::error::{SHARED_MEMORY, SpaceError, failed};
 use super::leftovers::sweep_dead_runs;
-use super::place::{Base, Found, Place, Presence, SHARED_MEMORY, shared_memory};
+use super::name::RunName;
+use super::place::{Base, Found, Place, Presence, shared_memory};
 use super::ports::{Factory, IoxInbox, IoxOutbox};
 use super::watchdog::within_bounds;
 use crate::transport::{Backlog, TransportError};
@@ -25,101 +27,10 @@ use ipc_schemas::{
 };
 use rustix::fs::statvfs;
 use rustix::io::Errno;
-use rustix::process::{Resource, getrlimit};
 use std::io::Write;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
-use std::str::FromStr;
-
-/// A valid run name: 1 to 32 characters of `[A-Za-z0-9_-]`, the first no dash, by which options begin.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct RunName(String);
-
-/// Not a run name.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{name:?} is not a run name; expected 1 to 32 letters, digits, '-' or '_', not beginning with '-'")]
-pub struct RunNameError {
-    /// What was given.
-    pub name: String,
-}
-
-impl FromStr for RunName {
-    type Err = RunNameError;
-
-    fn from_str(name: &str) -> Result<RunName, RunNameError> {
-        let valid = (1..=32).contains(&name.len())
-            && !name.starts_with('-')
-            && name.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
-        if valid { Ok(RunName(name.to_owned())) } else { Err(RunNameError { name: name.to_owned() }) }
-    }
-}
-
-impl std::fmt::Display for RunName {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-/// Why the space of a run could not be entered or used.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum SpaceError {
-    /// The run's world has not created the service (yet).
-    #[error("service {service} does not exist")]
-    NoService {
-        /// Service name.
-        service: String,
-    },
-    /// Another world has created the service.
-    #[error("service {service} exists already")]
-    Exists {
-        /// Service name.
-        service: String,
-    },
-    /// The other side declares the service with another record type or with other limits.
-    #[error("service {service} is declared differently by the other side: {reason}")]
-    Incompatible {
-        /// Service name.
-        service: String,
-        /// What iceoryx2 said.
-        reason: String,
-    },
-    /// A file or directory that is to be used is not ours.
-    #[error("cannot use {}: {problem}", .path.display())]
-    NotOurs {
-        /// Which.
-        path: PathBuf,
-        /// What is wrong with it.
-        problem: String,
-    },
-    /// Shared memory is full, or nearly.
-    #[error("{SHARED_MEMORY} has {free} of free memory; the run needs {needed}")]
-    NoRoom {
-        /// What is left.
-        free: String,
-        /// What may be needed.
-        needed: String,
-    },
-    /// iceoryx2 or the file system failed.
-    #[error("{what}: {reason}")]
-    Failed {
-        /// What was attempted.
-        what: String,
-        /// What was said.
-        reason: String,
-    },
-}
-
-/// With fewer files than this a process of a run may not get by.
-const FEW_FILES: u64 = 256;
-
-pub(super) fn failed(what: &str, reason: &dyn std::fmt::Debug) -> SpaceError {
-    // iceoryx2 does not tell for want of what it failed.
-    let few = getrlimit(Resource::Nofile).current.filter(|most| *most < FEW_FILES);
-    let hint =
-        few.map(|most| format!("; only {most} files may be open, see `ulimit -n`")).unwrap_or_default();
-    SpaceError::Failed { what: what.to_owned(), reason: format!("{reason:?}{hint}") }
-}
 
 /// How many ports of a service there may be, and what waits in them. Each send walks all subscriber slots, so
 /// these are tight.
@@ -544,4 +455,24 @@ impl AttachLine {
 
 fn attach_failure(service: &str, error: &dyn std::fmt::Debug) -> TransportError {
     TransportError::Failed { service: service.to_owned(), reason: format!("{error:?}") }
+}
+
+impl RunSpace {
+    /// Creates the bells of a run, as its world: the only one, which its services have shown.
+    pub fn create_bells(&self) -> Result<Bells, SpaceError> {
+        let path = &self.bells_path;
+        // What a killed world has left.
+        let _ = std::fs::remove_file(path);
+        Bells::create(path).map_err(|e| failed(&format!("create {}", path.display()), &e))
+    }
+
+    /// The bells of a run whose world has created its services.
+    pub fn bells(&self) -> Result<Bells, SpaceError> {
+        let path = &self.bells_path;
+        Bells::open(path).map_err(|e| match e.kind() {
+            // A world that has just begun makes them in a moment.
+            std::io::ErrorKind::NotFound => SpaceError::NoService { service: "bells".to_owned() },
+            _ => failed(&format!("use {}", path.display()), &e),
+        })
+    }
 }

@@ -5,25 +5,28 @@
 //! brakes to a stop, a restart in mid-run, steps that pass while the controller is stopped, and the end of the run. A bad frame is noted under the rule it
 //! breaks and replaced, so that one fault does not hide the others.
 
+mod answers;
+mod child;
+mod rules;
+
+pub use rules::{Breach, Report, Rule};
+
 use super::attach::{Readiness, Reception};
 use super::services::MembersDesk;
 use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::lockstep::Handover;
-use crate::scenario::Scenario;
-use crate::transport::iox::{IoxFrame, IoxInbox, IoxOutbox, RunName, RunSpace, ServiceLimits};
+use crate::scenario::{Override, Scenario, ScenarioError, load_given};
+use crate::transport::iox::{IoxInbox, IoxOutbox, RunName, RunSpace, ServiceLimits};
 use crate::transport::{Backlog, Frame, Inbox, Loan, Outbox};
-use crate::world::{CommandFault, World};
+use crate::world::World;
 use hdrhistogram::Histogram;
 use ipc_schemas::{
-    self as frames, Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault, Member, Role,
-    VehicleCommand, VehicleState,
+    self as frames, Assignment, FLAG_END_OF_RUN, FrameHeader, Role, VehicleCommand, VehicleState,
 };
-use rustix::process::{Pid, Signal, kill_process_group};
-use serde::Serialize;
-use std::os::unix::process::CommandExt;
-use std::process::{Child, Command, Stdio};
+use rustix::process::Signal;
+use std::process::Child;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -48,121 +51,14 @@ const CAUGHT_UP_BY: u64 = 880;
 const CATCH_UP_STEP: Duration = Duration::from_millis(50);
 const END_AT: u64 = 900;
 
-/// A rule of `docs/plugin-contract.md`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-#[serde(rename_all = "kebab-case")]
-#[allow(missing_docs)] // each is described by `text`
-pub enum Rule {
-    Attach,
-    Schema,
-    Run,
-    Sender,
-    Generation,
-    Step,
-    Count,
-    OncePerStep,
-    OwnVehicles,
-    NoDuplicates,
-    AllVehicles,
-    Zone,
-    Finite,
-    Limits,
-    Verdict,
-    EmptyZone,
-    Pause,
-    HardBraking,
-    Deadline,
-    Alive,
-    Restart,
-    CatchUp,
-    End,
+/// Where the script plays: behind a merge a junction, which the controller drives, with merges, a crossing, lanes
+/// that part, and several duties per vehicle.
+pub fn scenario() -> Result<Scenario, ScenarioError> {
+    let set: Override = format!("controllers=[{{name=\"{CONTROLLER}\", zones=[\"junction\"]}}]").parse()?;
+    load_given(include_str!("junction.toml"), Vec::new(), &[set], None)
 }
 
-impl Rule {
-    /// All rules, in the order of the report.
-    pub const ALL: [Rule; 23] = [
-        Rule::Attach,
-        Rule::Schema,
-        Rule::Run,
-        Rule::Sender,
-        Rule::Generation,
-        Rule::Step,
-        Rule::Count,
-        Rule::OncePerStep,
-        Rule::OwnVehicles,
-        Rule::NoDuplicates,
-        Rule::AllVehicles,
-        Rule::Zone,
-        Rule::Finite,
-        Rule::Limits,
-        Rule::Verdict,
-        Rule::EmptyZone,
-        Rule::Pause,
-        Rule::HardBraking,
-        Rule::Deadline,
-        Rule::Alive,
-        Rule::Restart,
-        Rule::CatchUp,
-        Rule::End,
-    ];
-
-    /// What the rule asks for.
-    pub fn text(self) -> &'static str {
-        match self {
-            Rule::Attach => "joins the run and says ready",
-            Rule::Schema => "has the schema of this version (schema_hash)",
-            Rule::Run => "answers for this run (run_id)",
-            Rule::Sender => "sends as the controller it was let in as (sender_role, sender_index)",
-            Rule::Generation => "carries the generation it was given (generation)",
-            Rule::Step => "answers the step it was asked (step)",
-            Rule::Count => "announces as many records as it sends (record_count)",
-            Rule::OncePerStep => "answers each step once",
-            Rule::OwnVehicles => "commands only its own vehicles (vehicle)",
-            Rule::NoDuplicates => "commands no vehicle twice (vehicle)",
-            Rule::AllVehicles => "commands all its vehicles, in frame order (vehicle)",
-            Rule::Zone => "names the vehicle's zone (zone)",
-            Rule::Finite => "sends numbers (u_mps2, planned exit)",
-            Rule::Limits => "keeps the vehicles' limits (u_mps2)",
-            Rule::Verdict => "gives a verdict from 0 to 3 (verdict)",
-            Rule::EmptyZone => "answers steps without vehicles",
-            Rule::Pause => "waits for a world that pauses",
-            Rule::HardBraking => "goes on while a leader brakes to a stop",
-            Rule::Deadline => "answers within the deadline, but for one step in a hundred",
-            Rule::Alive => "stays alive and answers every step",
-            Rule::Restart => "joins again after being killed, and goes on from there",
-            Rule::CatchUp => "goes on with the step at hand after steps have passed without it",
-            Rule::End => "ends with code 0 when the run does",
-        }
-    }
-}
-
-/// The first breach of a rule, and how many there were.
-#[derive(Clone, Debug, Serialize)]
-pub struct Breach {
-    /// The rule.
-    pub rule: Rule,
-    /// Step of the first.
-    pub step: u64,
-    /// What was wrong with it.
-    pub what: String,
-    /// Number of steps in which it was broken.
-    pub count: u64,
-}
-
-/// What a check has found.
-#[derive(Clone, Debug, Serialize)]
-pub struct Report {
-    /// Rules broken.
-    pub breaches: Vec<Breach>,
-    /// Rules that could not be tried, because the controller had gone.
-    pub untried: Vec<Rule>,
-    /// Steps answered.
-    pub answered: u64,
-    /// Answer times, us: median, 99th percentile, 99.9th, greatest.
-    pub latency_us: [f64; 4],
-}
-
-/// Checks a command line. `scenario` has one plug-in called [`CONTROLLER`].
+/// Checks a command line in a scenario with one plug-in, called [`CONTROLLER`].
 pub fn check(
     scenario: &Arc<Scenario>,
     command: &[String],
@@ -263,62 +159,6 @@ impl Kit<'_> {
         }
     }
 
-    fn start(&mut self) -> Result<(), ProcessError> {
-        let child = Command::new(&self.command[0])
-            .args(&self.command[1..])
-            .env("CZ_RUN", self.run.to_string())
-            .env("CZ_CONTROLLER", CONTROLLER)
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .process_group(0)
-            .spawn();
-        match child {
-            Ok(child) => self.child = Some(child),
-            Err(error) => self.breach(Rule::Attach, format!("cannot be started: {error}")),
-        }
-        Ok(())
-    }
-
-    /// Ends the controller, and whatever it started.
-    fn stop(&mut self) {
-        if let Some(mut child) = self.child.take() {
-            if let Some(group) = Pid::from_raw(child.id() as i32) {
-                let _ = kill_process_group(group, Signal::KILL);
-            }
-            let _ = child.wait();
-        }
-    }
-
-    /// How the controller has ended, if it has.
-    fn ended(&mut self) -> Option<String> {
-        let status = self.child.as_mut()?.try_wait().ok()??;
-        Some(format!("it ended: {status}"))
-    }
-
-    /// Waits for the controller to join and say ready.
-    fn admit(&mut self, rule: Rule) -> Result<bool, ProcessError> {
-        let deadline = Instant::now() + JOIN;
-        while !self.reception.is_ready(INDEX as usize) {
-            self.hand_over(None)?;
-            if let Some(reason) = self.reception.last_refusal.take() {
-                let rule = if reason.contains("schema") { Rule::Schema } else { rule };
-                self.breach(rule, format!("attach request refused: {reason}"));
-                return Ok(false);
-            }
-            let late = (Instant::now() >= deadline).then(|| format!("not ready after {} s", JOIN.as_secs()));
-            if let Some(how) = self.ended().or(late) {
-                self.breach(rule, how);
-                return Ok(false);
-            }
-            std::thread::sleep(Duration::from_millis(1));
-        }
-        // The coordinator is in this process, and so is its sending end.
-        let own =
-            Member { process_id: std::process::id(), role: frames::ROLE_COORDINATOR, ..Member::default() };
-        self.members.tell(self.world.step(), [own].into_iter())?;
-        Ok(true)
-    }
-
     /// Answers whoever asks what is in force; a state that has been sent has all its coordination.
     fn hand_over(&mut self, sent: Option<FrameHeader>) -> Result<(), ProcessError> {
         let Kit { reception, in_force, world, .. } = self;
@@ -411,15 +251,6 @@ impl Kit<'_> {
         }
     }
 
-    /// Stops the controller, and whatever it started, or lets them go on.
-    fn signal(&self, signal: Signal) {
-        let id = self.child.as_ref().and_then(|child| Pid::from_raw(child.id() as i32));
-        if let Some(group) = id {
-            // If it has ended, that is noticed soon enough.
-            let _ = kill_process_group(group, signal);
-        }
-    }
-
     /// Plays world and coordinator for one step, and decides for the built-in pool.
     fn publish(&mut self, states: &[VehicleState]) -> Result<Instant, ProcessError> {
         let step = self.world.step();
@@ -463,119 +294,6 @@ impl Kit<'_> {
         }
     }
 
-    /// What the kit puts in for the controller: accelerations of 0.
-    fn substitute(&self, states: &[VehicleState]) -> Vec<VehicleCommand> {
-        let drivers = self.world.drivers();
-        let is_own = |s: &&VehicleState| {
-            s.zone != frames::NO_ZONE
-                && s.flags & frames::STATE_LEFT == 0
-                && drivers.of(s.zone, s.path) == INDEX
-        };
-        let own = states.iter().filter(is_own);
-        own.map(|s| VehicleCommand { vehicle: s.vehicle, zone: s.zone, ..VehicleCommand::default() })
-            .collect()
-    }
-
-    /// Waits for the controller's answer, and takes it. `false` when there is no point in going on.
-    fn answer(&mut self, states: &[VehicleState], sent: Instant) -> Result<bool, ProcessError> {
-        let step = self.world.step();
-        let substitute = self.substitute(states);
-        let rule = match (step, substitute.is_empty()) {
-            (PAUSE_AT, _) => Rule::Pause,
-            (BRAKE_FROM..BRAKE_TO, _) => Rule::HardBraking,
-            (_, true) => Rule::EmptyZone,
-            _ => Rule::Alive,
-        };
-        let frame = loop {
-            if let Some(frame) = self.commands.receive()? {
-                break frame;
-            }
-            let waited = sent.elapsed();
-            if waited >= PATIENCE {
-                self.breach(rule, format!("no answer within {} s", PATIENCE.as_secs()));
-                return Ok(false);
-            }
-            if waited.as_millis() >= 2 {
-                if let Some(how) = self.ended() {
-                    self.breach(Rule::Alive, how);
-                    return Ok(false);
-                }
-                std::thread::sleep(Duration::from_micros(50));
-            } else {
-                std::thread::yield_now();
-            }
-        };
-        let took = sent.elapsed();
-        let _ = self.latency_ns.record(took.as_nanos() as u64);
-        self.answered += 1;
-        if took > self.deadline {
-            let ms = |d: Duration| d.as_secs_f64() * 1e3;
-            self.breach(
-                Rule::Deadline,
-                format!("took {:.1} ms, allowed are {:.1}", ms(took), ms(self.deadline)),
-            );
-        }
-        self.take(frame, states)?;
-        Ok(true)
-    }
-
-    /// Takes the controller's answer, or replaces it.
-    fn take(&mut self, frame: IoxFrame<VehicleCommand>, states: &[VehicleState]) -> Result<(), ProcessError> {
-        let step = self.world.step();
-        let substitute = self.substitute(states);
-        let generation = self.reception.generation(INDEX as usize);
-        let index = INDEX as u16;
-        let expected =
-            ExpectedHeader { run_id: self.run_id, role: Role::Controller, index, generation, step };
-        let header = expected.check(frame.header(), frame.records().len());
-        let mut records = frame.records().to_vec();
-        drop(frame);
-        // A second frame would be taken for the answer to the next step.
-        std::thread::yield_now();
-        while let Some(extra) = self.commands.receive()? {
-            let step = extra.header().step;
-            drop(extra);
-            self.breach(Rule::OncePerStep, format!("a second frame, with step {step} in its header"));
-        }
-        if let Err(fault) = header {
-            let rule = match fault {
-                HeaderFault::OtherSchema { .. } => Rule::Schema,
-                HeaderFault::OtherRun { .. } => Rule::Run,
-                HeaderFault::OtherSender { .. } => Rule::Sender,
-                HeaderFault::OldGeneration { .. } | HeaderFault::UnknownGeneration { .. } => Rule::Generation,
-                HeaderFault::OtherStep { .. } => Rule::Step,
-                HeaderFault::OtherCount { .. } => Rule::Count,
-            };
-            self.breach(rule, fault.to_string());
-            records.clone_from(&substitute);
-        }
-        if let Err(fault) = self.world.command(INDEX, &records) {
-            let rule = match fault {
-                CommandFault::UnknownVehicle { .. } | CommandFault::ForeignVehicle { .. } => {
-                    Rule::OwnVehicles
-                }
-                CommandFault::Duplicate { .. } => Rule::NoDuplicates,
-                CommandFault::MissingVehicle { .. } => Rule::AllVehicles,
-                CommandFault::OtherZone { .. } => Rule::Zone,
-                CommandFault::NotFinite { .. } | CommandFault::BadIntent { .. } => Rule::Finite,
-                CommandFault::OutOfLimits { .. } => Rule::Limits,
-                CommandFault::BadVerdict { .. } => Rule::Verdict,
-            };
-            self.breach(rule, fault.to_string());
-            self.world.forget_commands();
-            let mut all = substitute;
-            std::mem::swap(&mut records, &mut all);
-            // The built-in pool's commands were forgotten with the bad ones.
-            let mut own = Vec::new();
-            let time_s = self.world.time_ns() as f64 * 1e-9;
-            self.pool.command(time_s, states, |c| own.push(c)).expect("it has answered this step before");
-            self.world.command(0, &own).expect("the built-in pool answers as it should");
-            self.world.command(INDEX, &records).expect("the substitute is as it should be");
-        }
-        self.world.advance().expect("all vehicles have been commanded");
-        Ok(())
-    }
-
     /// Says that the run is over, and waits for the controller to end.
     fn finish(&mut self) -> Result<(), ProcessError> {
         let header = FrameHeader { flags: FLAG_END_OF_RUN, ..self.header(Role::World, self.world.step()) };
@@ -596,5 +314,43 @@ impl Kit<'_> {
                 None => std::thread::sleep(Duration::from_millis(2)),
             }
         }
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::lockstep::in_process::InProcess;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn a_vehicle_of_the_controller_has_duties_of_every_kind_at_several_points() {
+        let scenario = Arc::new(scenario().unwrap());
+        assert_eq!(scenario.plugins[0].paths.iter().map(|(zone, _)| *zone).collect::<Vec<_>>(), [1; 5]);
+        let mut run = InProcess::observed(&scenario, 1, 1);
+        let (mut busiest, mut kinds) = (0, BTreeSet::new());
+        let mut is_empty = 0;
+        for _ in 0..END_AT {
+            assert!(run.step().unwrap());
+            run.frames(|frames| {
+                is_empty += u64::from(!frames.state.iter().any(|s| s.zone == 1));
+                let own = frames.coordination.iter().flat_map(|part| part.iter()).filter(|a| a.zone == 1);
+                let own: Vec<&Assignment> = own.collect();
+                for duties in own.chunk_by(|a, b| a.vehicle == b.vehicle) {
+                    let points: BTreeSet<u32> =
+                        duties.iter().map(|a| a.point).filter(|point| *point != frames::NO_POINT).collect();
+                    busiest = busiest.max(points.len());
+                    kinds.extend(duties.iter().map(|a| a.kind));
+                }
+            })
+            .unwrap();
+        }
+        println!("{busiest} points, kinds {kinds:?}, {is_empty} empty steps");
+        assert!(busiest >= 3, "{busiest}");
+        for kind in [frames::CONSTRAINT_REAR_END, frames::CONSTRAINT_MERGE, frames::CONSTRAINT_CROSS] {
+            assert!(kinds.contains(&kind), "{kind}");
+        }
+        assert!(is_empty > 10, "{is_empty}");
     }
 }
