@@ -1,11 +1,15 @@
-//! Lower bounds: each vehicle alone against the reference and against descent.
+//! Lower bounds: each vehicle alone against the reference and against descent, pairs that merge against the
+//! centralised optimum of both orders.
 
 #![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
 
 use control_zones::bounds::alone::{End, Leg, optimum};
+use control_zones::bounds::{Traffic, joint, merging};
+use control_zones::compare::sample::Sample;
 use control_zones::control::Terminal;
 use control_zones::control::reference::Problem;
-use control_zones::scenario::ReferenceLaw;
+use control_zones::scenario::{ReferenceLaw, load};
+use std::sync::Arc;
 
 /// Cost of a speed profile, constant acceleration between equally spaced nodes.
 fn cost(beta: f64, legs: &[Leg], speeds: &[Vec<f64>]) -> f64 {
@@ -113,4 +117,55 @@ fn no_other_profile_is_cheaper() {
         assert!(least >= best.cost - 1e-9, "{least} {best:?}");
         assert!(least < best.cost * 1.004, "{least} {best:?}");
     }
+}
+
+/// A run of two vehicles that arrive on the given roads at the given instants.
+fn two(roads: [&str; 2], instants_s: [f64; 2]) -> (Arc<control_zones::scenario::Scenario>, Sample) {
+    let dir = tempfile::tempdir().unwrap();
+    let trace = dir.path().join("two.csv");
+    let rows: Vec<String> = (0..2).map(|i| format!("{},{},16\n", instants_s[i], roads[i])).collect();
+    std::fs::write(&trace, format!("time_s,road,speed_mps\n{}", rows.concat())).unwrap();
+    let set = format!("roads.*.demand={{ trace = \"{}\" }}", trace.display()).parse().unwrap();
+    let flow = "zones.*.flow={ policy = \"none\" }".parse().unwrap();
+    let scenario = Arc::new(load(Some("paper"), &[set, flow], Some(1)).unwrap());
+    let sample = Sample::of(&scenario, "two vehicles").unwrap();
+    (scenario, sample)
+}
+
+#[test]
+fn pairs_that_merge_cost_at_least_their_bound() {
+    // Both of the first zone, at once and a little apart; one that comes from it and one of the second zone.
+    for (roads, instants_s) in [
+        (["main1", "merge1"], [1.0, 1.0]),
+        (["main1", "merge1"], [1.0, 1.9]),
+        (["main1", "merge2"], [1.0, 11.3]),
+    ] {
+        let (scenario, sample) = two(roads, instants_s);
+        let entrants = sample.entrants();
+        let traffic = Traffic { scenario: &scenario, entrants: &entrants };
+        let bound = merging::bound(&traffic).unwrap();
+        let alone = traffic.alone().total;
+        let mut courses = sample.courses();
+        let mut orders = Vec::new();
+        for _ in 0..2 {
+            let found = joint::seek(&traffic, &courses).unwrap();
+            assert!(found.missed_s < 1e-3, "{found:?}");
+            orders.push(found.total);
+            // The other order: whoever passed first comes to pass last.
+            let ahead = usize::from(courses[1].last().unwrap().exit_s < courses[0].last().unwrap().exit_s);
+            courses[ahead].iter_mut().for_each(|course| course.exit_s += 6.0);
+        }
+        let least = orders[0].min(orders[1]);
+        assert_eq!(bound.pairs, 1, "{roads:?}");
+        assert!(alone + 1e-4 < bound.total, "{alone} {bound:?}");
+        assert!(bound.total <= least + 1e-9, "{bound:?} {orders:?}");
+        // The duality gap, the cells, and the stretches of the centralised optimum.
+        assert!(bound.total > alone + 0.5 * (least - alone), "{alone} {bound:?} {orders:?}");
+    }
+    // Far apart nobody has to merge.
+    let (scenario, sample) = two(["main1", "merge1"], [1.0, 15.0]);
+    let entrants = sample.entrants();
+    let traffic = Traffic { scenario: &scenario, entrants: &entrants };
+    assert_eq!(merging::bound(&traffic).unwrap().pairs, 0);
+    assert_eq!(traffic.bounds().merging_total, Some(traffic.alone().total));
 }

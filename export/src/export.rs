@@ -23,8 +23,8 @@ pub struct ExportArgs {
     /// The format.
     #[arg(long, value_name = "FORMAT")]
     pub to: Format,
-    /// The file to write, or the directory with csv and parquet, which have a file per table [default: beside the
-    /// recording].
+    /// The file to write, or the directory with csv and parquet, which have a file per table; beside the recording by
+    /// default.
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
 }

@@ -26,9 +26,10 @@ pub struct CompareArgs {
     /// Change a scenario key under all policies; may be repeated
     #[arg(long, value_name = "KEY=VALUE")]
     pub set: Vec<String>,
-    /// Seek the centralised optimum as well, where the network has merges only; takes minutes
-    #[arg(long)]
-    pub joint: bool,
+    /// Seek the centralised optimum as well, for the order in which the vehicles of this one of the policies pass, where
+    /// the network has merges only
+    #[arg(long, value_name = "POLICY", conflicts_with = "table")]
+    pub joint: Option<String>,
     /// Keep results of runs in this directory, and take from it what is there
     #[arg(long, value_name = "DIR")]
     pub cache: Option<PathBuf>,
@@ -89,13 +90,13 @@ pub fn main(args: &CompareArgs) -> Result<String, CompareError> {
     let cache = args.cache.as_deref().map_or(Ok(Cache::none()), Cache::at)?;
     let means = Means { jobs: args.jobs.map_or(cores, usize::from), cache };
     let comparisons = match &args.table {
-        Some(name) => tables::comparisons(name, args.seeds, args.joint),
+        Some(name) => tables::comparisons(name, args.seeds),
         None => vec![Comparison {
             policies: args.policies.clone(),
             scenario: args.scenario.clone(),
             seeds: args.seeds.unwrap_or(Seeds { from: 1, to: 20 }).all(),
             sets: args.set.clone(),
-            joint: args.joint,
+            joint: args.joint.clone(),
         }],
     };
     let bar = ProgressBar::new(0).with_style(

@@ -131,7 +131,7 @@ pub const MEASURES: [Measure; 30] = [
         (time_s > 0.0).then(|| (jerk / time_s).sqrt())
     }),
     measure("exposure", "exposure per vehicle, sum of zones, m·s", 3, Pool::Mean, |r| {
-        r.sample.zones.iter().map(|z| z.exposure_ms).sum()
+        Some(r.sample.zones.iter().map(|z| z.exposure_ms).sum())
     }),
     measure("delay_sd_s", "delay against alone, standard deviation, s", 2, Pool::Mean, |r| {
         let delays: Vec<f64> = delays_s(r).collect();

@@ -36,8 +36,8 @@ pub struct Comparison {
     pub seeds: Vec<u64>,
     /// `--set`s of all policies, before their own.
     pub sets: Vec<String>,
-    /// Whether the centralised optimum is sought too.
-    pub joint: bool,
+    /// The policy for whose passing order the centralised optimum is sought, if it is.
+    pub joint: Option<String>,
 }
 
 impl Comparison {
@@ -59,8 +59,8 @@ impl Comparison {
         let (from, to) = (self.seeds.first().unwrap_or(&1), self.seeds.last().unwrap_or(&1));
         ["--seeds", &format!("{from}-{to}")].iter().for_each(|word| add(word));
         self.sets.iter().for_each(|set| ["--set", set].iter().for_each(|word| add(word)));
-        if self.joint {
-            add("--joint");
+        if let Some(policy) = &self.joint {
+            ["--joint", policy].iter().for_each(|word| add(word));
         }
         text
     }
@@ -169,6 +169,13 @@ pub fn run(
         .map_err(|source| CompareError::Scenario { name: "none".into(), source: Box::new(source) })?;
     let policies = comparison.policies.iter().map(|name| policy::find(name, &base.network));
     let policies: Vec<Policy> = policies.collect::<Result<_, _>>()?;
+    let named = |name: &String| {
+        let at = policies.iter().position(|policy| policy.name == *name);
+        at.ok_or_else(|| {
+            CompareError::Usage(format!("--joint {name}: expected one of the policies compared"))
+        })
+    };
+    let ordered_by = comparison.joint.as_ref().map(named).transpose()?;
     let exit_mps = exit_speed(&policies, &mut performed, progress)?;
 
     let key = |performed: &Performed<'_>, seed, member: &Member| performed.key(seed, member.sets(exit_mps));
@@ -207,9 +214,8 @@ pub fn run(
         };
         rows.push(comparison.seeds.iter().zip(keys).map(of).collect());
     }
-    if comparison.joint {
-        let last = taken.last().expect("there is a policy");
-        seek_joint(last, &mut rows, &performed, progress)?;
+    if let Some(at) = ordered_by {
+        seek_joint(&taken[at], &mut rows, &performed, progress)?;
     }
     Ok(Block::new(comparison, &policies, exit_mps, &rows))
 }

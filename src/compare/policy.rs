@@ -11,7 +11,13 @@ use serde::Deserialize;
 use std::path::Path;
 
 /// Fragments that are part of the program.
-const EMBEDDED: [(&str, &str); 1] = [("paper-none", include_str!("policies/paper-none.toml"))];
+const EMBEDDED: [(&str, &str); 5] = [
+    ("paper-none", include_str!("policies/paper-none.toml")),
+    ("viable", include_str!("policies/viable.toml")),
+    ("viable-resequenced", include_str!("policies/viable-resequenced.toml")),
+    ("viable-gate", include_str!("policies/viable-gate.toml")),
+    ("viable-resequenced-gate", include_str!("policies/viable-resequenced-gate.toml")),
+];
 
 /// A policy's file.
 #[derive(Clone, Debug, Deserialize)]
@@ -66,7 +72,7 @@ impl Member {
 pub fn known() -> String {
     let embedded: Vec<&str> = EMBEDDED.iter().map(|(name, _)| *name).collect();
     format!(
-        "{}, paper-fixed-SPEED, paper-feedback, paper-mean-speed, paper-best, or the path of a TOML file; \
+        "{}, paper-fixed-SPEED, paper-feedback, paper-mean-speed, paper-predicted, paper-best, or the path of a TOML file; \
          NAME:KEY=VALUE;KEY=VALUE changes keys of one",
         embedded.join(", ")
     )
@@ -74,7 +80,10 @@ pub fn known() -> String {
 
 /// The policy without flow control, from which the paper's terminal speed of the last zone is measured.
 pub fn without_control() -> Member {
-    Member { sets: vec!["zones.*.flow={ policy = \"none\" }".to_owned()], measured: Vec::new() }
+    Member {
+        sets: law().chain(["zones.*.flow={ policy = \"none\" }".to_owned()]).collect(),
+        measured: Vec::new(),
+    }
 }
 
 /// The policy of that name on a network.
@@ -139,7 +148,8 @@ fn paper(name: &str, network: &Network) -> Result<Option<Policy>, String> {
     Ok(match name {
         "paper-feedback" if has_inner => Some(one("v_m = 18 - N(50 m)/2", FEEDBACK)),
         "paper-mean-speed" if has_inner => Some(one("v_m = mean speed + 2 - N(50 m)/2", MEAN_SPEED)),
-        "paper-feedback" | "paper-mean-speed" => return Err(refused()),
+        "paper-predicted" if has_inner => Some(one("v_m chosen by prediction", "{ policy = \"predicted\" }")),
+        "paper-feedback" | "paper-mean-speed" | "paper-predicted" => return Err(refused()),
         "paper-best" => {
             let mut members = vec![without_control()];
             if has_inner {
@@ -172,9 +182,16 @@ fn is_inner(zone: &Zone) -> bool {
 fn with_flow(network: &Network, flow: &str) -> Member {
     let (inner, outer): (Vec<&Zone>, Vec<&Zone>) = network.zones.iter().partition(|zone| is_inner(zone));
     Member {
-        sets: inner.iter().map(|zone| format!("zones.{}.flow={flow}", zone.name)).collect(),
+        sets: law().chain(inner.iter().map(|zone| format!("zones.{}.flow={flow}", zone.name))).collect(),
         measured: outer.iter().map(|zone| zone.name.clone()).collect(),
     }
+}
+
+/// What all policies of the paper have in common, whatever the scenario has.
+fn law() -> impl Iterator<Item = String> {
+    ["control.law=ocbf", "coordination.schedule=none", "gate.entry=free", "zones.*.order=fifo"]
+        .into_iter()
+        .map(str::to_owned)
 }
 
 fn fixed(speed_mps: f64) -> String {

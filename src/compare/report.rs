@@ -79,6 +79,50 @@ impl Block {
         }
     }
 
+    /// What decides between policies, a row each.
+    pub fn summary(&self) -> Grid {
+        let mut grid = Grid::new(
+            format!("{}, {} replicates", self.scenario, self.seeds.len()),
+            [
+                "policy",
+                "total",
+                "change, %",
+                "exposure, m·s",
+                "wait, s",
+                "infeasible",
+                "overlapping pairs",
+                "least margin of the viable, m",
+                "/ alone",
+                "/ merging",
+                "/ optimum",
+            ],
+        );
+        for policy in &self.policies {
+            let pooled = |id: &str| policy.measures[id].pooled;
+            let shown =
+                |value: Option<f64>, decimals| value.map_or(Entry::Empty(()), |v| number(v, decimals));
+            let change = policy.differences.iter().find(|d| d.measure == TOTAL.id).and_then(|d| d.percent);
+            let margins = [pooled("least_safe_rear_end_m"), pooled("least_safe_merge_m")];
+            let exposures = policy.exposures.iter().take(4);
+            let exposures: Vec<String> =
+                exposures.map(|(_, p)| p.pooled.map_or("–".into(), |e| format!("{e:.2}"))).collect();
+            grid.row([
+                format!("`{}`", policy.name).into(),
+                shown(pooled(TOTAL.id), 2),
+                change.map_or(Entry::Empty(()), |i| format!("{:+.1} ± {:.1}", i.mean, i.half_width()).into()),
+                exposures.join(" / ").into(),
+                shown(pooled("wait_s"), 2),
+                shown(pooled("infeasible"), 0),
+                shown(pooled("overlap_pairs"), 0),
+                shown(margins.into_iter().flatten().min_by(f64::total_cmp), 3),
+                shown(pooled("of_alone"), 3),
+                shown(pooled("of_merging"), 3),
+                shown(pooled("of_joint"), 3),
+            ]);
+        }
+        grid
+    }
+
     /// Everything that is told of each policy: a row per measure, a column per policy.
     pub fn values(&self) -> Grid {
         let columns = ["measure".to_owned()].into_iter().chain(self.policies.iter().map(|p| p.name.clone()));
@@ -173,6 +217,7 @@ impl Block {
         if self.policies.len() > 1 {
             grids.push(self.differences());
         }
+        grids.push(self.summary());
         grids
     }
 }
@@ -196,7 +241,7 @@ fn result(policy: &Policy, own: &[Row], first: &[Row]) -> PolicyResult {
             percent: interval(|(a, b)| 100.0 * (a - b) / b),
         }
     };
-    let exposure = |zone: usize| move |row: &Row| row.sample.zones[zone].exposure_ms;
+    let exposure = |zone: usize| move |row: &Row| Some(row.sample.zones[zone].exposure_ms);
     let mut differences: Vec<Difference> = MEASURES.iter().map(|m| pair(m.id, &m.of)).collect();
     differences
         .extend(names.iter().enumerate().map(|(at, name)| pair(&format!("exposure {name}"), &exposure(at))));
@@ -206,7 +251,7 @@ fn result(policy: &Policy, own: &[Row], first: &[Row]) -> PolicyResult {
         members: policy.members.iter().map(|m| m.sets.clone()).collect(),
         taken: own.iter().map(|row| row.member).collect(),
         zones: per_zone(&|row, zone| complete(row, row.sample.zone_costs()[zone])),
-        exposures: per_zone(&|row, zone| row.sample.zones[zone].exposure_ms),
+        exposures: per_zone(&|row, zone| Some(row.sample.zones[zone].exposure_ms)),
         measures: MEASURES.iter().map(|m| (m.id, over(&m.of, m.pool))).collect(),
         differences,
     }

@@ -38,7 +38,7 @@ pub struct ZoneSample {
     /// Name.
     pub name: String,
     /// The integral of the missing rear-end margin over time, per vehicle, m s.
-    pub exposure_ms: Option<f64>,
+    pub exposure_ms: f64,
     /// Vehicles that met an infeasible program.
     pub infeasible: u32,
     /// Vehicles in feasibility-enforcement mode.
@@ -203,7 +203,7 @@ impl Observer {
         }
         let zones = summary.zones.iter().map(|z| ZoneSample {
             name: z.zone.clone(),
-            exposure_ms: None,
+            exposure_ms: z.mean_exposure_m_s,
             infeasible: z.infeasible_vehicles,
             enforced: z.fe_vehicles,
             least_safe_m: [z.min_rear_end_margin_clean_m, z.min_merge_margin_clean_m],

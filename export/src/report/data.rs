@@ -182,7 +182,7 @@ impl<'a> Gathering<'a> {
             *late += u64::from(step.missed(controller));
         }
         self.margins_of(moment, time_s);
-        if step.header.step % self.stride == 0 {
+        if step.header.step.is_multiple_of(self.stride) {
             self.samples(moment, time_s);
         }
     }

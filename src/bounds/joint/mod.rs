@@ -19,7 +19,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// Rate at which missing distance must be made up, 1/s.
-const RECOVERY_PER_S: f64 = 1.0;
+const RECOVERY_PER_S: f64 = 0.6;
 /// Length of the stretches of constant acceleration, about, m.
 const STRETCH_M: f64 = 12.5;
 /// Programs at most.
