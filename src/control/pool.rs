@@ -429,9 +429,13 @@ impl Renewed {
                 return Err(PoolError::Unassigned { zone, present, assigned: self.members.len() });
             }
             // Both lists are in order of entry, so one pass finds every vehicle that stayed.
+            // One that has come back is a newcomer, also when nothing was said of the zone since it left it empty.
+            let is_newcomer = state.flags & frames::STATE_ENTERED != 0;
             let memory = loop {
                 match known.peek() {
-                    Some(old) if old.vehicle == state.vehicle => break old.memory,
+                    Some(old) if old.vehicle == state.vehicle => {
+                        break if is_newcomer { Words::ENTERED } else { old.memory };
+                    }
                     Some(_) if before.iter().any(|m| m.vehicle == state.vehicle) => known.next(),
                     _ => break Words::ENTERED,
                 };
@@ -537,6 +541,36 @@ fn command(state: &VehicleState, decision: &Decision, memory: &Words) -> Vehicle
 mod tests {
     use super::*;
     use crate::scenario::load_embedded;
+
+    #[test]
+    fn a_vehicle_that_comes_back_into_a_zone_it_left_empty_remembers_nothing() {
+        let scenario = Arc::new(load_embedded("roundabout", &[], None).unwrap());
+        let mut pool = ControllerPool::new(scenario.clone(), 0..3);
+        let enters = VehicleState {
+            v_mps: 8.0,
+            entry_speed_mps: 8.0,
+            flags: frames::STATE_ENTERED,
+            ..VehicleState::default()
+        };
+        let alone = Assignment {
+            own_conflict_m: 60.0,
+            partner_conflict_m: 60.0,
+            partner: frames::NO_VEHICLE,
+            flags: frames::ASSIGNMENT_FREE_TERMINAL,
+            ..Assignment::default()
+        };
+        let mut plan_of = |time_s: f64| {
+            let now = [VehicleState { entry_time_s: time_s, ..enters }];
+            pool.coordinate(&now, &[alone]).unwrap();
+            let mut planned = None;
+            pool.command(time_s, &now, |command| planned = Some(command.planned_exit_time_s)).unwrap();
+            planned.unwrap() - time_s
+        };
+        // Of an empty zone nothing is said, so that between the two the pool hears nothing.
+        let first_s = plan_of(10.0);
+        assert_eq!(plan_of(500.0), first_s);
+        assert!(first_s > 0.0);
+    }
 
     #[test]
     fn assignments_the_law_could_not_plan_with_are_refused() {
