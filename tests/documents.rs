@@ -14,7 +14,8 @@ use std::process::Command;
 /// Folders with nothing of ours in them, or nothing that documents speak of.
 const SKIPPED: [&str; 4] = ["target", ".git", "__pycache__", "build"];
 /// Subcommands that other programs of this workspace have, and where these are.
-const SIBLINGS: [(&str, &str); 2] = [("export", "export/src"), ("report", "export/src")];
+const SIBLINGS: [(&str, &str); 4] =
+    [("export", "export/src"), ("report", "export/src"), ("top", "view/src"), ("view", "view/src")];
 /// Flags that documents say there is not.
 const NOT_THERE: [&str; 1] = ["--isolate"];
 /// Names of other people's code.

@@ -240,7 +240,7 @@ impl<'a> Events<'a> {
 
     /// All of them, by first step.
     pub fn finish(mut self) -> Vec<Event> {
-        self.all.sort_by(|a, b| (a.first_step, a.kind).cmp(&(b.first_step, b.kind)));
+        self.all.sort_by_key(|event| (event.first_step, event.kind));
         self.all
     }
 }

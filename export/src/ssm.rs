@@ -32,6 +32,9 @@ fn code(kind: DutyKind) -> &'static str {
     }
 }
 
+/// What is said of the worst sample: place, time, code of the encounter, value, speed.
+type Extreme = ((f64, f64), String, &'static str, String, String);
+
 /// One sample of a conflict.
 #[derive(Clone, Debug)]
 struct Sample {
@@ -255,15 +258,11 @@ impl<'a> Ssm<'a> {
         self.values(name, values)
     }
 
-    fn values(
-        &mut self,
-        name: &str,
-        values: Option<((f64, f64), String, &str, String, String)>,
-    ) -> Result<(), OutError> {
+    fn values(&mut self, name: &str, values: Option<Extreme>) -> Result<(), OutError> {
         let na = || "NA".to_owned();
         let (position, time, kind, value, speed) = match values {
-            Some((place, time, kind, value, speed)) => {
-                (format!("{},{}", number(place.0), number(place.1)), time, kind.to_owned(), value, speed)
+            Some(((x, y), time, kind, value, speed)) => {
+                (format!("{},{}", number(x), number(y)), time, kind.to_owned(), value, speed)
             }
             None => (na(), na(), na(), na(), na()),
         };

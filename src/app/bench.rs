@@ -1,7 +1,8 @@
 //! `cz bench`: measurements.
 
 use super::args::{
-    BenchArgs, BenchKind, ConductArgs, PeerArgs, Restart, ScenarioArgs, ShareArgs, SideBySide, TimingArgs,
+    BenchArgs, BenchKind, ConductArgs, PeerArgs, Restart, ScenarioArgs, ShareArgs, SideBySide, SteeringArgs,
+    TimingArgs,
 };
 use super::measured::{WAIT, align, run_as, scenario_of, start_peer, table};
 use super::{AppError, print};
@@ -65,7 +66,14 @@ fn run_processes(
     let share = ShareArgs { ctrl_procs: controllers, coord_procs: 1 };
     let restart = if record.is_some() { Restart::OnFailure } else { Restart::Never };
     let (wait_mode, timing) = (WaitMode::default(), TimingArgs::default());
-    let conduct = ConductArgs { wait: WAIT, wait_mode, restart, timing, record_lag: None };
+    let conduct = ConductArgs {
+        wait: WAIT,
+        wait_mode,
+        restart,
+        timing,
+        record_lag: None,
+        steering: SteeringArgs::default(),
+    };
     run_as(scenario, share, conduct, record)
 }
 

@@ -1,7 +1,9 @@
 //! `cz bench wait`: how the ways of waiting are run, and the table.
 
 use super::AppError;
-use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs, TimingArgs, WaitArgs, WaitBenchArgs};
+use super::args::{
+    ConductArgs, Restart, ScenarioArgs, ShareArgs, SteeringArgs, TimingArgs, WaitArgs, WaitBenchArgs,
+};
 use super::measured::{WAIT, align, run_as, scenario_of, start_peer, table as new_table};
 use crate::bench::{self, BenchError, NINE, Side, THREE, Timed, WaitingOptions, WaitingReport};
 use crate::process::{Placement, WaitMode, check_cores};
@@ -21,6 +23,7 @@ fn conduct(wait_mode: WaitMode) -> ConductArgs {
         restart: Restart::OnFailure,
         timing: TimingArgs::default(),
         record_lag: None,
+        steering: SteeringArgs::default(),
     }
 }
 

@@ -151,6 +151,8 @@ pub fn cz() -> ExitCode {
             args::Command::Sdk { command } => sdk::sdk(&command),
             args::Command::Export(args) => sibling::EXPORT.run(&args.arguments),
             args::Command::Report(args) => sibling::REPORT.run(&args.arguments),
+            args::Command::View(args) => sibling::VIEW.run(&args.arguments),
+            args::Command::Top(args) => sibling::TOP.run(&args.arguments),
         },
     )
 }

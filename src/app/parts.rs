@@ -61,6 +61,8 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
         timing: args.conduct.timing.timing()?,
         observed: args.observed || observation.is_some(),
         record_lag: args.conduct.record_lag(),
+        is_steered: args.conduct.steering.steered,
+        begins_paused: args.conduct.steering.begin_paused,
         run_id: Some(run_id),
     };
     let tell = report_to(args.supervised, &args.conduct.wait);

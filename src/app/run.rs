@@ -5,7 +5,7 @@ use super::progress::{Bar, Position};
 use super::record::Recording;
 use super::report::{Summary, Transport};
 use super::supervise::{Plan, conduct};
-use super::{AppError, controllers, report};
+use super::{AppError, controllers, report, sibling};
 use crate::lockstep::in_process::InProcess;
 use crate::process::{StopFlag, WaitMode, check_cores, new_run_id, run_in_process, run_in_process_observed};
 use crate::scenario::Scenario;
@@ -14,6 +14,12 @@ use crate::world::World;
 use std::sync::Arc;
 
 pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
+    if args.view {
+        // It starts this run itself, without the flag.
+        let own = std::env::args_os().skip(2).filter(|argument| argument != "--view");
+        let arguments: Vec<_> = ["--".into()].into_iter().chain(own).collect();
+        return sibling::VIEW.run(&arguments);
+    }
     let mut arguments = args.scenario.clone();
     arguments.set.extend(args.shield.iter().map(|mode| format!("shield={mode}")));
     let (arguments, scenario) = controllers::load(&arguments, &args.controllers)?;

@@ -1,4 +1,4 @@
-//! Commands that are programs of their own: `cz report` is `cz-report`, beside `cz`, as with git and cargo. What they
+//! Commands that are programs of their own: `cz view` is `cz-view`, beside `cz`, as with git and cargo. What they
 //! need of other people's crates is not in the runtime.
 
 use super::AppError;
@@ -14,6 +14,10 @@ pub(super) struct Sibling {
     pub package: &'static str,
 }
 
+/// `cz view`.
+pub(super) const VIEW: Sibling = Sibling { program: "cz-view", package: "cz-view" };
+/// `cz top`.
+pub(super) const TOP: Sibling = Sibling { program: "cz-top", package: "cz-view" };
 /// `cz export`.
 pub(super) const EXPORT: Sibling = Sibling { program: "cz-export", package: "cz-export" };
 /// `cz report`.

@@ -57,6 +57,8 @@ where
     /// The verdict of what was put in.
     put_in_verdict: u16,
     observer: Option<Box<dyn Observer>>,
+    /// Whether the observer is shown anything.
+    shows: bool,
     /// The records of the state published last, for the observer.
     published: Vec<VehicleState>,
     phase: Phase,
@@ -111,6 +113,7 @@ where
             put_in: 0,
             put_in_verdict: 0,
             observer: None,
+            shows: true,
             published: Vec::new(),
             phase: Phase::Publish,
         }
@@ -119,6 +122,11 @@ where
     /// Shows every step to an observer from now on; needs the ledger.
     pub fn observe(&mut self, observer: Box<dyn Observer>) {
         self.observer = Some(observer);
+    }
+
+    /// Whether steps are shown to the observer from the next one on; called between steps.
+    pub fn show_steps(&mut self, shows: bool) {
+        self.shows = shows;
     }
 
     /// Keeps a ledger that has been begun already, in place of its own.
@@ -315,7 +323,7 @@ where
         let world = &mut self.world;
         let count = world.record_count();
         let loan = self.ports.state.loan(header, count, |slots| world.publish(slots))?;
-        if self.observer.is_some() {
+        if self.shows && self.observer.is_some() {
             self.published.clear();
             self.published.extend_from_slice(loan.records());
         }
@@ -363,6 +371,9 @@ where
     /// Shows the step to the observer, with the commands of so many controllers.
     fn show(&mut self, controllers: usize) -> Result<(), LockstepError> {
         let (Some(observer), Some(ledger)) = (&mut self.observer, &self.ledger) else { return Ok(()) };
+        if !self.shows {
+            return Ok(());
+        }
         let zones = self.world.scenario().network.zones.len() as u32;
         let count = self.coordinators.len() as u32;
         let process_of = |zone| (0..count).find(|&i| zones_of(zones, i, count).contains(&zone));

@@ -3,6 +3,7 @@
 use super::attach::{Readiness, Reception};
 use super::pace::Pacer;
 use super::services::{Driver, MembersDesk};
+use super::viewing::Viewing;
 use super::{OnMiss, Peer, Peers, ProcessError, Replacement, StopFlag, Waiter};
 use crate::lockstep::Awaited;
 use ipc_schemas::Role;
@@ -22,6 +23,8 @@ pub(super) struct House {
     pub members: MembersDesk,
     pub replace: bool,
     pub pacer: Pacer,
+    /// There is one when the run may be looked at.
+    pub viewing: Option<Viewing>,
     /// The step's deadline has passed, and this is the verdict of what is put in for whoever is missing.
     pub overdue: Option<u16>,
     /// Who has died last and was not replaced yet.
@@ -48,6 +51,7 @@ impl House {
             } else {
                 std::thread::sleep(left.min(LONGEST_SLEEP));
                 self.attend(driver, waiter)?;
+                self.attend_views(driver)?;
             }
         }
         self.pacer.begin(step);
@@ -107,6 +111,11 @@ impl House {
     fn may_be_replaced(&self, peer: Peer) -> bool {
         let is_plugin = peer.role == Role::Controller && self.reception.is_plugin(peer.index as usize);
         self.replace && !is_plugin
+    }
+
+    /// Sees to whoever looks; between two steps.
+    pub(super) fn attend_views(&mut self, driver: &mut Driver) -> Result<(), ProcessError> {
+        self.viewing.as_mut().map_or(Ok(()), |viewing| viewing.attend(driver, &mut self.pacer))
     }
 
     /// Sees to whoever has come.

@@ -15,6 +15,7 @@ mod run_spec;
 pub mod seating;
 mod services;
 mod stop;
+mod viewing;
 mod wait;
 mod wait_policy;
 mod world;
@@ -31,6 +32,7 @@ pub use restore::{RestoreError, restore};
 pub use run_spec::plugin_bytes;
 pub use services::expected_vehicles;
 pub use stop::{StopFlag, signals_to_heed};
+pub use viewing::{Notice, Order, Place, Watched};
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
     Departure, WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process,

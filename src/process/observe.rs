@@ -79,7 +79,7 @@ pub(super) fn create(
     let per_vehicle = size_of::<VehicleState>() + size_of::<VehicleCommand>() + 2 * size_of::<Assignment>();
     let expected = vehicles * per_vehicle + 64 * scenario.network.zones.len() + 1024;
     let waiting = (WAITING_BYTES / expected).clamp(FEWEST_WAITING, MOST_WAITING);
-    let outbox = space.create_blocks(SERVICE_OBSERVER, expected, waiting, lag == RecordLag::Drop)?;
+    let outbox = space.create_blocks(SERVICE_OBSERVER, expected, (waiting, 1), lag == RecordLag::Drop)?;
     Ok(ObservedSteps { outbox, lag, patience, stop: stop.clone(), ended: false })
 }
 

@@ -1,5 +1,6 @@
 //! Steps at their instants, and what becomes of those that are not done in time.
 
+use super::viewing::Order;
 use super::{Percentiles, new_histogram};
 use crate::lockstep::Awaited;
 use crate::scenario::ControllerNames;
@@ -88,7 +89,13 @@ pub struct MissedBy {
 #[derive(Debug)]
 pub(super) struct Pacer {
     timing: Timing,
+    /// Wall time of a step.
     step_length: Duration,
+    /// Simulated time of one.
+    dt: Duration,
+    /// Nobody begins a step, but for those that are granted.
+    is_paused: bool,
+    granted: u32,
     /// Scheduled beginning of the first step, and its number.
     origin: Option<(Instant, u64)>,
     deadline: Option<Instant>,
@@ -103,12 +110,19 @@ pub(super) struct Pacer {
 
 /// The last stretch before an instant is spent polling the clock: a sleep may take this much longer.
 const LAST_STRETCH: Duration = Duration::from_micros(200);
+/// Time between two looks for orders in a pause.
+const PAUSE_LOOK: Duration = Duration::from_millis(5);
+/// Paces that may be asked for, times real time.
+const PACES: std::ops::RangeInclusive<f64> = 0.001..=1000.0;
 
 impl Pacer {
     pub fn new(timing: Timing, dt_ns: u64) -> Pacer {
         Pacer {
             timing,
             step_length: Duration::from_nanos(dt_ns),
+            dt: Duration::from_nanos(dt_ns),
+            is_paused: false,
+            granted: 0,
             origin: None,
             deadline: None,
             began_late: false,
@@ -127,6 +141,12 @@ impl Pacer {
     /// How long may be slept before a step is due; nothing in the last stretch, in which the clock is to be
     /// polled. `None` once it is due.
     pub fn until(&mut self, step: u64) -> Option<Duration> {
+        if self.is_paused && self.granted == 0 {
+            return Some(PAUSE_LOOK);
+        }
+        if self.is_paused {
+            return None;
+        }
         if self.timing.pace == Pace::Free {
             return None;
         }
@@ -143,6 +163,11 @@ impl Pacer {
 
     /// A step begins now.
     pub fn begin(&mut self, step: u64) {
+        if self.is_paused {
+            self.granted = self.granted.saturating_sub(1);
+            // The schedule begins anew when the run goes on.
+            self.origin = None;
+        }
         if self.timing.pace == Pace::Free && self.timing.deadline.is_none() {
             return;
         }
@@ -158,6 +183,44 @@ impl Pacer {
             // Whoever held up the steps before has been counted there.
             self.missed_steps += 1;
             self.backlog += 1;
+        }
+    }
+
+    /// Does what somebody who steers the run asks for, between two steps.
+    pub fn order(&mut self, order: Order, step: u64) {
+        match order {
+            Order::Pause => (self.is_paused, self.granted) = (true, 0),
+            Order::Resume if self.is_paused => {
+                self.is_paused = false;
+                self.origin = None;
+            }
+            Order::Resume => {}
+            Order::Step(steps) => (self.is_paused, self.granted) = (true, self.granted.saturating_add(steps)),
+            Order::Pace(pace) if pace == 0.0 => self.timing.pace = Pace::Free,
+            Order::Pace(pace) if PACES.contains(&pace) => {
+                self.timing.pace = Pace::Realtime;
+                self.step_length = self.dt.div_f64(pace);
+                self.origin = Some((Instant::now(), step));
+            }
+            Order::Pace(_) => {}
+        }
+    }
+
+    /// Whether no step begins until somebody says so.
+    pub fn is_paused(&self) -> bool {
+        self.is_paused
+    }
+
+    /// Whether steps begin at scheduled instants.
+    pub fn is_scheduled(&self) -> bool {
+        self.is_paused || self.timing.pace == Pace::Realtime
+    }
+
+    /// So many times real time; 0 as fast as possible.
+    pub fn pace(&self) -> f64 {
+        match self.timing.pace {
+            Pace::Free => 0.0,
+            Pace::Realtime => self.dt.as_secs_f64() / self.step_length.as_secs_f64(),
         }
     }
 

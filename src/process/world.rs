@@ -8,11 +8,12 @@ use super::pace::Pacer;
 use super::peers::is_alive;
 use super::placement::number_of_cores;
 use super::services::{Driver, Services, expected_vehicles};
-use super::{Pace, Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
+use super::viewing::{Order, Viewing};
+use super::{Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Handover, Ledger, Progress, Seat, WorldDriver};
 use crate::own_time::Bound;
-use crate::record::{FileSource, Reader, ReplayError, replay_world};
+use crate::record::{FileSource, Processes, Reader, ReplayError, replay_world};
 use crate::scenario::Scenario;
 use crate::step::StepFrames;
 use crate::transport::iox::{RunName, RunSpace, SpaceError};
@@ -45,6 +46,10 @@ pub struct WorldOptions {
     pub observed: bool,
     /// What becomes of steps that whoever looks on cannot take yet.
     pub record_lag: RecordLag,
+    /// Whether whoever looks may pause the run, have it make steps, and set its pace.
+    pub is_steered: bool,
+    /// Whether it begins paused, as long as it waits for participants at most, until somebody who looks lets it go on.
+    pub begins_paused: bool,
     /// The run's id, where it has been chosen already.
     pub run_id: Option<u64>,
 }
@@ -52,7 +57,7 @@ pub struct WorldOptions {
 impl WorldOptions {
     /// Whether the world keeps what others need who take a place, or catch up.
     fn keeps(&self) -> bool {
-        self.replace || self.observed || self.timing.on_miss.verdict().is_some()
+        self.replace || self.observed || self.is_steered || self.timing.on_miss.verdict().is_some()
     }
 }
 
@@ -166,6 +171,17 @@ pub fn run_world(
         }
         false => None,
     };
+    // What is shown is what is kept.
+    let mut viewing = match ledger {
+        Some(_) => {
+            let sizes = (expected_vehicles(scenario), run_id);
+            let processes = Processes { coordinators, controllers };
+            let steering = options.is_steered.then_some(options.attach_timeout);
+            let attempt = || Viewing::create(&space, scenario, sizes, processes, steering);
+            Some(create(&space, &options.run, stop, attempt)?)
+        }
+        None => None,
+    };
     let bells = space.create_bells()?;
     let ports = services.world_ports(&bells, scenario, wait)?;
     let mut members = services.members_desk(run_id)?;
@@ -189,8 +205,8 @@ pub fn run_world(
     if missed {
         driver.go_on_after_miss();
     }
-    if let Some(steps) = observed {
-        driver.observe(Box::new(steps));
+    if let Some(viewing) = &mut viewing {
+        viewing.show_to(&mut driver, observed);
     }
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
     let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
@@ -204,12 +220,15 @@ pub fn run_world(
         members,
         replace: options.replace,
         pacer: Pacer::new(options.timing, scenario.dt_ns),
+        viewing,
         overdue: None,
         gone: None,
         arrived: Vec::new(),
     };
+    if options.begins_paused && options.is_steered {
+        house.pacer.order(Order::Pause, first_step);
+    }
     let mut history = History::default();
-    let is_paced = options.timing.pace == Pace::Realtime;
     // Declared last, so let go first.
     let _held = held;
     let mut meter = StepMeter::start();
@@ -217,7 +236,7 @@ pub fn run_world(
     loop {
         if driver.is_between_steps() {
             house.begin_step(&mut driver, &mut waiter, stop)?;
-            meter.begin_step(is_paced);
+            meter.begin_step(house.pacer.is_scheduled());
         }
         match driver.advance().map_err(|error| waiter.explain(error))? {
             Progress::Finished => {
@@ -240,10 +259,14 @@ pub fn run_world(
         waiter.reset();
         house.overdue = None;
         let ns = meter.step_done(driver.was_event());
+        if let Some(viewing) = &mut house.viewing {
+            viewing.step_done(step - 1, ns);
+        }
         history.replacements.extend(house.step_done(ns));
-        if is_paced || step.is_multiple_of(STEPS_PER_LOOK) {
+        if house.pacer.is_scheduled() || step.is_multiple_of(STEPS_PER_LOOK) {
             progress(driver.world());
             house.attend(&mut driver, &mut waiter)?;
+            house.attend_views(&mut driver)?;
             if stop.is_set() {
                 return Err(ProcessError::Interrupted { step: Some(step) });
             }

@@ -66,7 +66,7 @@ pub fn page(runs: &[Run], figures: &[(Figure<'_>, String)], latency: &[Latency])
     }
     heading(&mut page, "figures", "Figures");
     if runs.len() > 1 {
-        let first = escape(&runs[0].name()).into_owned();
+        let first = escape(runs[0].name()).into_owned();
         let _ = writeln!(page, "<p>Of <code>{first}</code>, but for those of all runs.</p>");
     }
     for (figure, svg) in figures {

@@ -131,6 +131,17 @@ pub(in crate::app) enum Restart {
     OnFailure,
 }
 
+/// What whoever looks may do.
+#[derive(Clone, Copy, Debug, Default, Args)]
+pub(in crate::app) struct SteeringArgs {
+    /// Let a view pause the run, have it make single steps, and set its pace.
+    #[arg(long)]
+    pub steered: bool,
+    /// Begin only when the view says so.
+    #[arg(long, hide = true, requires = "steered")]
+    pub begin_paused: bool,
+}
+
 /// How the processes of a run wait, keep time, and what becomes of those that die.
 #[derive(Clone, Copy, Debug, Args)]
 pub(in crate::app) struct ConductArgs {
@@ -144,6 +155,8 @@ pub(in crate::app) struct ConductArgs {
     pub restart: Restart,
     #[command(flatten)]
     pub timing: TimingArgs,
+    #[command(flatten)]
+    pub steering: SteeringArgs,
     /// What becomes of a step that cannot be recorded in time: the run waits, or the recording lacks it
     /// [default: wait; with a deadline: drop].
     #[arg(long, value_enum)]
@@ -158,6 +171,8 @@ impl ConductArgs {
         flags.extend(["--restart".to_owned(), name_of(self.restart)]);
         flags.extend(self.timing.to_flags());
         flags.extend(["--record-lag".to_owned(), name_of(self.record_lag())]);
+        flags.extend(self.steering.steered.then(|| "--steered".to_owned()));
+        flags.extend(self.steering.begin_paused.then(|| "--begin-paused".to_owned()));
         flags
     }
 

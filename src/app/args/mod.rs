@@ -11,7 +11,7 @@ use crate::compare::cli::CompareArgs;
 use crate::reproduce::cli::ReproduceArgs;
 pub(super) use bench::{BenchArgs, BenchKind, PeerArgs, WaitBenchArgs};
 use clap::{Args, Parser, Subcommand};
-pub(super) use conduct::{ConductArgs, Restart, ShareArgs, TimingArgs, WaitArgs};
+pub(super) use conduct::{ConductArgs, Restart, ShareArgs, SteeringArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
 pub(super) use run::{KeepArgs, PartArgs, RunArgs, SupervisedArgs, WorldArgs};
 pub(super) use scenario::{ScenarioArgs, SideBySide};
@@ -46,6 +46,12 @@ pub(super) enum Command {
     Plan(PlanArgs),
     /// Show a recording: what it is of, one of its steps, or a vehicle's course.
     Show(ShowArgs),
+    /// Watch a scenario, a run, or one or two recordings in the browser (the program cz-view).
+    #[command(disable_help_flag = true, disable_version_flag = true)]
+    View(SiblingArgs),
+    /// Watch a run in the terminal (the program cz-top).
+    #[command(disable_help_flag = true, disable_version_flag = true)]
+    Top(SiblingArgs),
     /// Compare two recordings: the first step, vehicle and field in which they differ.
     Verify(VerifyArgs),
     /// Run every role of a recording again from its recorded inputs and compare.

@@ -25,6 +25,9 @@ pub(in crate::app) struct RunArgs {
     /// Record every frame of the run in this file (.czlog); an older recording is replaced.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
+    /// Watch the run in the browser (the program cz-view), which may steer it.
+    #[arg(long, conflicts_with = "in_process")]
+    pub view: bool,
     #[command(flatten)]
     pub supervised: SupervisedArgs,
 }

@@ -80,13 +80,13 @@ impl BlockInbox {
 }
 
 impl RunSpace {
-    /// Creates a service for blocks of about so many bytes, as many of which may wait to be read; when there are
-    /// more, the oldest gives way, or the newest is not sent.
+    /// Creates a service for blocks of about so many bytes, so many of which may wait to be read by each of so many
+    /// readers; when there are more, the oldest gives way, or the newest is not sent.
     pub fn create_blocks(
         &self,
         name: &str,
         expected: usize,
-        waiting: usize,
+        (waiting, readers): (usize, usize),
         overflows: bool,
     ) -> Result<BlockOutbox, SpaceError> {
         let factory = self
@@ -97,8 +97,8 @@ impl RunSpace {
             .subscriber_max_buffer_size(waiting)
             .subscriber_max_borrowed_samples(2)
             .max_publishers(1)
-            .max_subscribers(1)
-            .max_nodes(3)
+            .max_subscribers(readers)
+            .max_nodes(2 + readers)
             .create()
             .map_err(|e| failed(&format!("create service {name}"), &e))?;
         let publisher = factory
@@ -123,5 +123,84 @@ impl RunSpace {
             .create()
             .map_err(|e| failed(&format!("create a subscriber of {name}"), &e))?;
         Ok(Some(BlockInbox { service: name.to_owned(), subscriber }))
+    }
+}
+
+/// Bytes of an order at most.
+const MOST_ORDER_BYTES: usize = 256;
+/// Orders that may wait to be taken, and processes that may give some.
+const WAITING_ORDERS: usize = 16;
+const GIVERS: usize = 2;
+
+/// Where orders come in: a few bytes each, from whoever has opened the other end.
+#[derive(Debug)]
+pub struct OrderInbox {
+    service: String,
+    subscriber: Subscriber<ipc::Service, [u8], ()>,
+    _factory: PortFactory<ipc::Service, [u8], ()>,
+}
+
+/// Where orders are given.
+#[derive(Debug)]
+pub struct OrderOutbox {
+    service: String,
+    publisher: Publisher<ipc::Service, [u8], ()>,
+}
+
+impl OrderInbox {
+    /// A copy of the next order, if there is one.
+    pub fn receive(&self) -> Result<Option<Vec<u8>>, TransportError> {
+        match self.subscriber.receive() {
+            Ok(sample) => Ok(sample.map(|sample| sample.payload().to_vec())),
+            Err(e) => Err(TransportError::Failed { service: self.service.clone(), reason: format!("{e:?}") }),
+        }
+    }
+}
+
+impl OrderOutbox {
+    /// Gives an order.
+    pub fn send(&self, order: &[u8]) -> Result<(), TransportError> {
+        let failed = |reason: String| TransportError::Failed { service: self.service.clone(), reason };
+        let mut sample = self.publisher.loan_slice(order.len()).map_err(|e| failed(format!("{e:?}")))?;
+        sample.payload_mut().copy_from_slice(order);
+        sample.send().map_err(|e| failed(format!("{e:?}")))?;
+        Ok(())
+    }
+}
+
+impl RunSpace {
+    /// Creates a service for orders.
+    pub fn create_orders(&self, name: &str) -> Result<OrderInbox, SpaceError> {
+        let factory = self
+            .node()
+            .service_builder(&service_name(name)?)
+            .publish_subscribe::<[u8]>()
+            .enable_safe_overflow(true)
+            .subscriber_max_buffer_size(WAITING_ORDERS)
+            .max_publishers(GIVERS)
+            .max_subscribers(1)
+            .max_nodes(2 + GIVERS)
+            .create()
+            .map_err(|e| failed(&format!("create service {name}"), &e))?;
+        let subscriber = factory
+            .subscriber_builder()
+            .create()
+            .map_err(|e| failed(&format!("create a subscriber of {name}"), &e))?;
+        Ok(OrderInbox { service: name.to_owned(), subscriber, _factory: factory })
+    }
+
+    /// Opens the end at which orders are given; `None` when there is no such service.
+    pub fn open_orders(&self, name: &str) -> Result<Option<OrderOutbox>, SpaceError> {
+        let Ok(factory) =
+            self.node().service_builder(&service_name(name)?).publish_subscribe::<[u8]>().open()
+        else {
+            return Ok(None);
+        };
+        let publisher = factory
+            .publisher_builder()
+            .initial_max_slice_len(MOST_ORDER_BYTES)
+            .create()
+            .map_err(|e| failed(&format!("create a publisher of {name}"), &e))?;
+        Ok(Some(OrderOutbox { service: name.to_owned(), publisher }))
     }
 }

@@ -94,7 +94,7 @@ pub struct RunSpace {
 
 /// The file in shared memory that names a run's world, and the same while it is written.
 const WORLD: &str = "world";
-const WORLD_BEGINNING: &str = "world.begins";
+const BEGINNING: &str = ".begins";
 /// Of the 255 characters iceoryx2 allows a path, what its longest file names leave for directory and prefix.
 const LONGEST_PATH: usize = 136;
 /// Room in shared memory below which no run is begun, bytes.
@@ -151,13 +151,23 @@ impl RunSpace {
 
     /// Says that this process is the run's world and has created its services.
     pub fn announce_world(&self) -> Result<(), SpaceError> {
-        let (path, beginning) = (self.file(WORLD), self.file(WORLD_BEGINNING));
+        self.put(WORLD, std::process::id().to_string().as_bytes())
+    }
+
+    /// Puts a file beside the run's others, for its owner alone.
+    pub fn put(&self, name: &str, bytes: &[u8]) -> Result<(), SpaceError> {
+        let (path, beginning) = (self.file(name), self.file(&format!("{name}{BEGINNING}")));
         // Complete when it appears under its name.
         let open =
             std::fs::OpenOptions::new().write(true).create(true).truncate(true).mode(0o600).open(&beginning);
-        open.and_then(|mut file| file.write_all(std::process::id().to_string().as_bytes()))
+        open.and_then(|mut file| file.write_all(bytes))
             .and_then(|()| std::fs::rename(&beginning, &path))
             .map_err(|e| failed(&format!("write {}", path.display()), &e))
+    }
+
+    /// What is in a file beside the run's others, if there is one.
+    pub fn get(&self, name: &str) -> Option<Vec<u8>> {
+        std::fs::read(self.file(name)).ok()
     }
 
     /// Takes down what a world that is gone has said.
