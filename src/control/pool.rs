@@ -568,7 +568,8 @@ mod tests {
         };
         // Of an empty zone nothing is said, so that between the two the pool hears nothing.
         let first_s = plan_of(10.0);
-        assert_eq!(plan_of(500.0), first_s);
+        let second_s = plan_of(500.0);
+        assert!((second_s - first_s).abs() < 1e-9, "{first_s} s, then {second_s} s");
         assert!(first_s > 0.0);
     }
 
