@@ -196,7 +196,7 @@ impl Pacer {
             }
             Order::Resume => {}
             Order::Step(steps) => (self.is_paused, self.granted) = (true, self.granted.saturating_add(steps)),
-            Order::Pace(pace) if pace == 0.0 => self.timing.pace = Pace::Free,
+            Order::Pace(0.0) => self.timing.pace = Pace::Free,
             Order::Pace(pace) if PACES.contains(&pace) => {
                 self.timing.pace = Pace::Realtime;
                 self.step_length = self.dt.div_f64(pace);
