@@ -4,7 +4,7 @@
 //! driven exactly, and instants follow from speeds. Cost is the sum of the zones' mean costs. Toward the vehicle
 //! ahead on the same path, at each place, and toward the one that passes a merge before it, at its own passing, a
 //! vehicle keeps `phi v + delta`, as instants: it is nowhere before the other was that far ahead. A vehicle that comes
-//! in closer than that may stay closer for a while, by as much as decays at [`RECOVERY_PER_S`].
+//! in closer than that may stay closer for a while, by as much as decays at `RECOVERY_PER_S`.
 //!
 //! Cost is nearly convex in the speeds, instants are not: a sequence of quadratic programs (`program`), each
 //! within a trust region, with an exact penalty. What it ends in is a **local** optimum, with speeds that anybody
