@@ -338,26 +338,31 @@ pub struct Reference {
 
 impl Reference {
     /// Position after `t_s` on the plan, counted from its origin, m.
+    #[inline]
     pub fn distance_m(&self, t_s: f64) -> f64 {
         ((self.optimum.a / 6.0 * t_s + 0.5 * self.optimum.b) * t_s + self.v0_mps) * t_s
     }
 
     /// Speed after `t_s` on the plan, m/s.
+    #[inline]
     pub fn speed_mps(&self, t_s: f64) -> f64 {
         (0.5 * self.optimum.a * t_s + self.optimum.b) * t_s + self.v0_mps
     }
 
     /// Acceleration after `t_s` on the plan, m/s^2.
+    #[inline]
     pub fn acceleration_mps2(&self, t_s: f64) -> f64 {
         self.optimum.a * t_s + self.optimum.b
     }
 
     /// Instant at which the plan ends, s.
+    #[inline]
     pub fn exit_time_s(&self) -> f64 {
         self.start_s + self.optimum.duration_s
     }
 
     /// Speed at which the plan ends, m/s.
+    #[inline]
     pub fn exit_speed_mps(&self) -> f64 {
         match self.terminal {
             Terminal::Speed(w) => w,
@@ -368,7 +373,8 @@ impl Reference {
     /// Reference speed and acceleration for a vehicle that is at `x_m` at instant `t_s`, found through
     /// the reference time t_ref at which the plan is at the same position (section "Control and speed
     /// reference trajectories"); t_ref is kept within the plan.
-    #[inline]
+    // Into whoever asks, however many do: called, it takes a vehicle a quarter longer to decide.
+    #[inline(always)]
     pub fn at(&self, feedback: PositionFeedback, t_s: f64, x_m: f64) -> (f64, f64) {
         let duration = self.optimum.duration_s;
         let distance = x_m - self.origin_m;
