@@ -58,6 +58,24 @@ fn clean(site: &Site, temporary: &Path, arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).unwrap()
 }
 
+/// Files that nobody but this test may remove.
+struct Planted(Vec<PathBuf>);
+
+impl Planted {
+    fn new(paths: Vec<PathBuf>) -> Planted {
+        paths.iter().for_each(|path| std::fs::write(path, "").unwrap());
+        Planted(paths)
+    }
+}
+
+impl Drop for Planted {
+    fn drop(&mut self) {
+        for path in &self.0 {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}
+
 #[test]
 fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     let _alone = ALONE.lock();
@@ -88,7 +106,8 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     .map(|name| shm.join(name))
     .collect();
     others.push(site.runs().join("not a run"));
-    others.iter().for_each(|path| std::fs::write(path, "").unwrap());
+    // Taken away again however this test ends: nobody else may.
+    let others = Planted::new(others);
     // A process that was, and is no more.
     let mut ended = std::process::Command::new("true").spawn().unwrap();
     ended.wait().unwrap();
@@ -118,10 +137,10 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     for path in &expected {
         assert!(!path.exists(), "{path:?} is still there");
     }
-    for path in &others {
+    for path in &others.0 {
         assert!(path.exists(), "{path:?} has been removed");
-        std::fs::remove_file(path).unwrap();
     }
+    drop(others);
 
     send(world(&parts), Signal::CONT);
     assert_eq!(survivor.ended().hash(), common::hash(&in_process));

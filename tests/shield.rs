@@ -4,12 +4,15 @@
 
 #[path = "common/adversaries.rs"]
 mod adversaries;
+#[path = "common/shares.rs"]
+mod shares;
 
 use adversaries::{always_u_max, leaders_that_stop, random_flips};
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{EntryRule, Override, PassingOrder, Scenario, load};
 use control_zones::world::{ShieldRow, World};
 use ipc_schemas::{VehicleCommand, VehicleState};
+use shares::assert_one_hash;
 use std::sync::Arc;
 
 const VEHICLE_STEPS: u64 = 1_000_000;
@@ -249,17 +252,8 @@ fn one_hash_where_paths_cross() {
             let mut scenario = load(Some(network), &[], None).unwrap();
             scenario.max_vehicles = Some(60);
             scenario.network.zones.iter_mut().for_each(|zone| zone.order = order);
-            let scenario = Arc::new(scenario);
-            let zones = scenario.network.zones.len() as u32;
-            let hash = |coordinators: u32, controllers: u32| {
-                let mut run = InProcess::new(&scenario, coordinators.min(zones), controllers.min(zones));
-                run.run().unwrap();
-                run.world().summary().state_hash
-            };
-            let expected = hash(1, 1);
-            for (coordinators, controllers) in [(2, 1), (1, 2), (3, 3), (9, 4)] {
-                assert_eq!(hash(coordinators, controllers), expected, "{network}, {order:?}");
-            }
+            let what = format!("{network}, {order:?}");
+            assert_one_hash(&Arc::new(scenario), &[(2, 1), (1, 2), (3, 3), (9, 4)], &what);
         }
     }
 }

@@ -3,6 +3,11 @@
 
 #![allow(clippy::unwrap_used)] // a test
 
+#[path = "common/random.rs"]
+mod random;
+#[path = "common/shares.rs"]
+mod shares;
+
 use control_zones::conflict::DutyKind;
 use control_zones::control::law::{Decision, Law, Partner, Schedule, Situation, Verdict, Words};
 use control_zones::control::qp::Tracking;
@@ -14,23 +19,9 @@ use control_zones::shield::{self, Shield};
 use control_zones::vehicle::Held;
 use control_zones::world::WorldSummary;
 use proptest::prelude::*;
+use random::Random;
+use shares::assert_one_hash;
 use std::sync::Arc;
-
-/// A small generator of its own, so that the trials do not depend on anybody's version.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        (self.0 >> 11) as f64 / (1u64 << 53) as f64
-    }
-
-    fn between(&mut self, low: f64, high: f64) -> f64 {
-        low + (high - low) * self.next()
-    }
-}
 
 fn scenario(name: &str, sets: &[&str], seed: u64) -> Scenario {
     let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
@@ -445,16 +436,6 @@ fn one_hash_for_any_number_of_processes() {
     for name in ["two-merges", "intersection", "roundabout", "grid-3x3"] {
         let mut scenario = scenario(name, &["control.law=viable", "gate.entry=viable"], 1);
         scenario.max_vehicles = Some(60);
-        let scenario = Arc::new(scenario);
-        let zones = scenario.network.zones.len() as u32;
-        let hash = |coordinators: u32, controllers: u32| {
-            let mut run = InProcess::new(&scenario, coordinators.min(zones), controllers.min(zones));
-            run.run().unwrap();
-            run.world().summary().state_hash
-        };
-        let expected = hash(1, 1);
-        for (coordinators, controllers) in [(2, 1), (1, 2), (3, 3)] {
-            assert_eq!(hash(coordinators, controllers), expected, "{name}");
-        }
+        assert_one_hash(&Arc::new(scenario), &[(2, 1), (1, 2), (3, 3)], name);
     }
 }

@@ -1,18 +1,10 @@
 //! Controllers that mean harm: what the shield is tested against.
 
+#[path = "random.rs"]
+mod random;
+
 use ipc_schemas::VehicleState;
-
-/// A small generator of its own, so that the adversaries do not depend on anybody's version.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> f64 {
-        self.0 ^= self.0 << 13;
-        self.0 ^= self.0 >> 7;
-        self.0 ^= self.0 << 17;
-        (self.0 >> 11) as f64 / (1u64 << 53) as f64
-    }
-}
+use random::Random;
 
 /// Everybody accelerates as hard as it can, always.
 pub fn always_u_max() -> impl FnMut(u64, &VehicleState) -> f64 {

@@ -29,10 +29,10 @@ const INK: RGBColor = RGBColor(34, 34, 34);
 const GREY: RGBColor = RGBColor(120, 120, 120);
 const PALE: RGBColor = RGBColor(232, 232, 232);
 /// Feasibility enforcement, and rows that could not be satisfied.
-const FE: RGBColor = RGBColor(213, 94, 0);
+const FE: RGBColor = COLOURS[1];
 const INFEASIBLE: RGBColor = RGBColor(0, 0, 0);
-const MERGE: RGBColor = RGBColor(230, 159, 0);
-const CROSSING: RGBColor = RGBColor(204, 121, 167);
+const MERGE: RGBColor = COLOURS[4];
+const CROSSING: RGBColor = COLOURS[3];
 /// Speeds from 0 to the greatest: viridis without its palest end.
 const SPEEDS: [RGBColor; 8] = [
     RGBColor(68, 1, 84),
