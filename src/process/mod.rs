@@ -32,7 +32,7 @@ pub use restore::{RestoreError, restore};
 pub use run_spec::plugin_bytes;
 pub use services::expected_vehicles;
 pub use stop::{StopFlag, signals_to_heed};
-pub use viewing::{Notice, Order, Place, Watched};
+pub use viewing::{Notice, Place, Steering, Watched};
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
     Departure, WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process,

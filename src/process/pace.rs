@@ -1,6 +1,6 @@
 //! Steps at their instants, and what becomes of those that are not done in time.
 
-use super::viewing::Order;
+use super::viewing::Steering;
 use super::{Percentiles, new_histogram};
 use crate::lockstep::Awaited;
 use crate::scenario::ControllerNames;
@@ -110,7 +110,7 @@ pub(super) struct Pacer {
 
 /// The last stretch before an instant is spent polling the clock: a sleep may take this much longer.
 const LAST_STRETCH: Duration = Duration::from_micros(200);
-/// Time between two looks for orders in a pause.
+/// Time between two looks in a pause for somebody who steers.
 const PAUSE_LOOK: Duration = Duration::from_millis(5);
 /// Paces that may be asked for, times real time.
 const PACES: std::ops::RangeInclusive<f64> = 0.001..=1000.0;
@@ -187,22 +187,24 @@ impl Pacer {
     }
 
     /// Does what somebody who steers the run asks for, between two steps.
-    pub fn order(&mut self, order: Order, step: u64) {
-        match order {
-            Order::Pause => (self.is_paused, self.granted) = (true, 0),
-            Order::Resume if self.is_paused => {
+    pub fn steer(&mut self, steering: Steering, step: u64) {
+        match steering {
+            Steering::Pause => (self.is_paused, self.granted) = (true, 0),
+            Steering::Resume if self.is_paused => {
                 self.is_paused = false;
                 self.origin = None;
             }
-            Order::Resume => {}
-            Order::Step(steps) => (self.is_paused, self.granted) = (true, self.granted.saturating_add(steps)),
-            Order::Pace(0.0) => self.timing.pace = Pace::Free,
-            Order::Pace(pace) if PACES.contains(&pace) => {
+            Steering::Resume => {}
+            Steering::Step(steps) => {
+                (self.is_paused, self.granted) = (true, self.granted.saturating_add(steps))
+            }
+            Steering::Pace(0.0) => self.timing.pace = Pace::Free,
+            Steering::Pace(pace) if PACES.contains(&pace) => {
                 self.timing.pace = Pace::Realtime;
                 self.step_length = self.dt.div_f64(pace);
                 self.origin = Some((Instant::now(), step));
             }
-            Order::Pace(_) => {}
+            Steering::Pace(_) => {}
         }
     }
 

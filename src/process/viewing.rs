@@ -14,7 +14,7 @@ use crate::scenario::{Scenario, kept};
 use crate::step::{Step, StepFrames};
 use crate::transport::TransportError;
 use crate::transport::iox::{
-    Block, BlockInbox, BlockOutbox, OrderInbox, OrderOutbox, RunName, RunSpace, SpaceError,
+    Block, BlockInbox, BlockOutbox, RunName, RunSpace, SpaceError, SteeringInbox, SteeringOutbox,
 };
 use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState};
 use serde::{Deserialize, Serialize};
@@ -27,8 +27,8 @@ use std::time::{Duration, Instant};
 const SERVICE_VIEW: &str = "cz/view";
 /// World → views: a [`Notice`] now and then, while somebody looks. Overflows.
 const SERVICE_NOTICES: &str = "cz/notices";
-/// Views → world: [`Order`]s.
-const SERVICE_ORDERS: &str = "cz/orders";
+/// Views → world: [`Steering`].
+const SERVICE_STEERING: &str = "cz/steering";
 /// What the file is called in which the run says what it is.
 const ABOUT: &str = "about";
 
@@ -86,7 +86,7 @@ pub struct Place {
 /// What may be asked of a run that is steered.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Order {
+pub enum Steering {
     /// No further step until told.
     Pause,
     /// On, at the pace there was.
@@ -102,7 +102,7 @@ pub enum Order {
 pub(super) struct Viewing {
     steps: Rc<BlockOutbox>,
     notices: BlockOutbox,
-    orders: Option<OrderInbox>,
+    steering: Option<SteeringInbox>,
     /// When a run that somebody has paused goes on, if nobody looks.
     left_at: Instant,
     is_watched: Rc<Cell<bool>>,
@@ -138,7 +138,7 @@ impl Viewing {
         scenario: &Scenario,
         (vehicles, run_id): (usize, u64),
         processes: Processes,
-        steering: Option<Duration>,
+        patience: Option<Duration>,
     ) -> Result<Viewing, SpaceError> {
         let metadata = Metadata::new(scenario, ScenarioSource::default(), run_id, processes);
         let mut about = Vec::new();
@@ -151,8 +151,8 @@ impl Viewing {
         Ok(Viewing {
             steps: Rc::new(space.create_blocks(SERVICE_VIEW, expected, (waiting, VIEWS), true)?),
             notices: space.create_blocks(SERVICE_NOTICES, 4096, (16, VIEWS), true)?,
-            orders: if steering.is_some() { Some(space.create_orders(SERVICE_ORDERS)?) } else { None },
-            left_at: Instant::now() + steering.unwrap_or_default(),
+            steering: if patience.is_some() { Some(space.create_steering(SERVICE_STEERING)?) } else { None },
+            left_at: Instant::now() + patience.unwrap_or_default(),
             is_watched: Rc::default(),
             is_recorded: false,
             noticed: None,
@@ -179,7 +179,7 @@ impl Viewing {
         }
     }
 
-    /// Sees whether somebody looks, takes orders, and tells how the run goes; called between two steps, now and then.
+    /// Sees whether somebody looks and steers, and tells how the run goes; called between two steps, now and then.
     pub fn attend(&mut self, driver: &mut Driver, pacer: &mut Pacer) -> Result<(), ProcessError> {
         let is_watched = self.steps.has_reader();
         if is_watched != self.is_watched.replace(is_watched) {
@@ -187,12 +187,12 @@ impl Viewing {
             self.latency_us.clear();
             self.noticed = None;
         }
-        if let Some(orders) = &self.orders {
+        if let Some(steering) = &self.steering {
             let step = driver.world().step();
-            while let Some(bytes) = orders.receive()? {
-                // What is no order is nobody's of ours.
-                if let Ok(order) = serde_json::from_slice(&bytes) {
-                    pacer.order(order, step);
+            while let Some(bytes) = steering.receive()? {
+                // What is none is nobody's of ours.
+                if let Ok(wish) = serde_json::from_slice(&bytes) {
+                    pacer.steer(wish, step);
                     self.noticed = None;
                 }
             }
@@ -200,7 +200,7 @@ impl Viewing {
                 self.left_at = Instant::now() + LEAVING;
             } else if Instant::now() >= self.left_at {
                 // Nobody is left to let it go on.
-                pacer.order(Order::Resume, step);
+                pacer.steer(Steering::Resume, step);
             }
         }
         if is_watched && self.noticed.is_none_or(|at| at.elapsed() >= NOTICE_EVERY) {
@@ -235,7 +235,7 @@ impl Viewing {
             late_frames: driver.late_frames(),
             is_paused: pacer.is_paused(),
             pace: pacer.pace(),
-            is_steered: self.orders.is_some(),
+            is_steered: self.steering.is_some(),
         }
     }
 }
@@ -245,7 +245,7 @@ impl Viewing {
 pub struct Watched {
     steps: BlockInbox,
     notices: BlockInbox,
-    orders: Option<OrderOutbox>,
+    steering: Option<SteeringOutbox>,
     world: u32,
     _space: RunSpace,
 }
@@ -267,8 +267,8 @@ impl Watched {
         else {
             return Ok(None);
         };
-        let orders = space.open_orders(SERVICE_ORDERS)?;
-        Ok(Some((Watched { steps, notices, orders, world, _space: space }, metadata, Arc::new(scenario))))
+        let steering = space.open_steering(SERVICE_STEERING)?;
+        Ok(Some((Watched { steps, notices, steering, world, _space: space }, metadata, Arc::new(scenario))))
     }
 
     /// The next step, with its number.
@@ -293,13 +293,13 @@ impl Watched {
 
     /// Whether it may be steered.
     pub fn is_steered(&self) -> bool {
-        self.orders.is_some()
+        self.steering.is_some()
     }
 
     /// Steers it; `false` when the run does not let itself be steered.
-    pub fn order(&self, order: &Order) -> Result<bool, ProcessError> {
-        let Some(orders) = &self.orders else { return Ok(false) };
-        orders.send(&serde_json::to_vec(order).expect("an order is a word and a number"))?;
+    pub fn steer(&self, wish: &Steering) -> Result<bool, ProcessError> {
+        let Some(steering) = &self.steering else { return Ok(false) };
+        steering.send(&serde_json::to_vec(wish).expect("steering is a word and a number"))?;
         Ok(true)
     }
 

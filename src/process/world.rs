@@ -8,7 +8,7 @@ use super::pace::Pacer;
 use super::peers::is_alive;
 use super::placement::number_of_cores;
 use super::services::{Driver, Services, expected_vehicles};
-use super::viewing::{Order, Viewing};
+use super::viewing::{Steering, Viewing};
 use super::{Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
 use crate::lockstep::{Handover, Ledger, Progress, Seat, WorldDriver};
@@ -226,7 +226,7 @@ pub fn run_world(
         arrived: Vec::new(),
     };
     if options.begins_paused && options.is_steered {
-        house.pacer.order(Order::Pause, first_step);
+        house.pacer.steer(Steering::Pause, first_step);
     }
     let mut history = History::default();
     // Declared last, so let go first.

@@ -3,7 +3,7 @@
 use crate::index::EventKind;
 use crate::run::{Live, Run};
 use crate::steps::{Kept, Steps};
-use control_zones::process::{Notice, Order, ProcessError, Watched};
+use control_zones::process::{Notice, ProcessError, Steering, Watched};
 use control_zones::record::Metadata;
 use control_zones::scenario::Scenario;
 use control_zones::step::Step;
@@ -32,7 +32,7 @@ struct Progress {
 #[derive(Debug)]
 struct Going {
     progress: Arc<Mutex<Progress>>,
-    orders: Mutex<Sender<Order>>,
+    steering: Mutex<Sender<Steering>>,
     /// Whether it waits for somebody to look, and has been told that somebody does.
     waits: bool,
     has_begun: AtomicBool,
@@ -67,11 +67,11 @@ impl Live for Going {
 
     fn begin(&self) {
         if !self.has_begun.swap(true, Ordering::Relaxed) && self.waits {
-            let _ = self.orders.lock().unwrap_or_else(PoisonError::into_inner).send(Order::Resume);
+            let _ = self.steering.lock().unwrap_or_else(PoisonError::into_inner).send(Steering::Resume);
         }
     }
 
-    fn steer(&self, order: &Order) -> Result<(), String> {
+    fn steer(&self, wish: &Steering) -> Result<(), String> {
         let progress = self.progress();
         if progress.is_over {
             return Err("the run is over".to_owned());
@@ -79,8 +79,8 @@ impl Live for Going {
         if !progress.notice.is_steered {
             return Err("the run was not started with --steered".to_owned());
         }
-        let orders = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
-        orders.send(*order).map_err(|_| "the run is over".to_owned())
+        let steering = self.steering.lock().unwrap_or_else(PoisonError::into_inner);
+        steering.send(*wish).map_err(|_| "the run is over".to_owned())
     }
 
     fn latencies(&self) -> Vec<(u64, f32)> {
@@ -119,7 +119,7 @@ pub fn watch(
     let deadline = Instant::now() + within;
     // Ports of the run stay with one thread.
     let (opened, is_open) = channel();
-    let (orders, to_give) = channel();
+    let (steering, to_give) = channel();
     let run_name = name.clone();
     let thread = std::thread::Builder::new().name("watch".to_owned());
     let (stop, stopped) = channel::<()>();
@@ -127,8 +127,12 @@ pub fn watch(
     loop {
         match is_open.recv_timeout(Duration::from_millis(20)) {
             Ok(Ok((metadata, scenario, kept, progress, whole))) => {
-                let live =
-                    Going { progress, orders: Mutex::new(orders), waits, has_begun: AtomicBool::new(false) };
+                let live = Going {
+                    progress,
+                    steering: Mutex::new(steering),
+                    waits,
+                    has_begun: AtomicBool::new(false),
+                };
                 let run = Run::new(
                     name.to_string(),
                     metadata,
@@ -156,7 +160,7 @@ type Opened = (Metadata, Arc<Scenario>, Arc<Kept>, Arc<Mutex<Progress>>, Sender<
 fn take(
     name: &RunName,
     opened: &Sender<Result<Opened, String>>,
-    orders: &Receiver<Order>,
+    steering: &Receiver<Steering>,
     stopped: &Receiver<()>,
 ) {
     let (watched, metadata, scenario) = loop {
@@ -180,20 +184,20 @@ fn take(
         return;
     }
     let Ok(run) = is_whole.recv() else { return };
-    let ended = follow(&watched, &run, &kept, &progress, orders);
+    let ended = follow(&watched, &run, &kept, &progress, steering);
     let mut progress = locked(&progress);
     progress.is_over = true;
     progress.problem = ended.err().map(|error| error.to_string());
     run.index().is_complete = true;
 }
 
-/// Takes steps and notices, and gives orders, until the run is over.
+/// Takes steps and notices, and steers, until the run is over.
 fn follow(
     watched: &Watched,
     run: &Run,
     kept: &Kept,
     progress: &Mutex<Progress>,
-    orders: &Receiver<Order>,
+    steering: &Receiver<Steering>,
 ) -> Result<(), ProcessError> {
     let mut looked = Instant::now();
     loop {
@@ -216,10 +220,10 @@ fn follow(
         while let Some(notice) = watched.notice()? {
             take_notice(run, &mut locked(progress), notice);
         }
-        while let Ok(order) = orders.try_recv() {
+        while let Ok(wish) = steering.try_recv() {
             let step = run.steps.range().map_or(0, |(_, last)| last);
-            run.index().say(step, EventKind::Steered, words(&order), None);
-            watched.order(&order)?;
+            run.index().say(step, EventKind::Steered, words(&wish), None);
+            watched.steer(&wish)?;
         }
         if is_idle {
             if !goes_on {
@@ -251,12 +255,12 @@ fn take_notice(run: &Run, progress: &mut Progress, notice: Notice) {
     progress.notice = notice;
 }
 
-fn words(order: &Order) -> String {
-    match order {
-        Order::Pause => "steered: pause".to_owned(),
-        Order::Resume => "steered: go on".to_owned(),
-        Order::Step(steps) => format!("steered: {steps} steps"),
-        Order::Pace(pace) if *pace == 0.0 => "steered: as fast as it can".to_owned(),
-        Order::Pace(pace) => format!("steered: {pace} times real time"),
+fn words(steering: &Steering) -> String {
+    match steering {
+        Steering::Pause => "steered: pause".to_owned(),
+        Steering::Resume => "steered: go on".to_owned(),
+        Steering::Step(steps) => format!("steered: {steps} steps"),
+        Steering::Pace(pace) if *pace == 0.0 => "steered: as fast as it can".to_owned(),
+        Steering::Pace(pace) => format!("steered: {pace} times real time"),
     }
 }

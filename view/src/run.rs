@@ -3,7 +3,7 @@
 use crate::index::Index;
 use crate::network::NetworkView;
 use crate::steps::Steps;
-use control_zones::process::Order;
+use control_zones::process::Steering;
 use control_zones::record::{FileSource, Metadata, Reader};
 use control_zones::scenario::Scenario;
 use serde_json::{Value, json};
@@ -17,7 +17,7 @@ pub trait Live: Send + Sync {
     /// Lets it begin, if it waits for somebody to look.
     fn begin(&self);
     /// Steers it, or says why it cannot be.
-    fn steer(&self, order: &Order) -> Result<(), String>;
+    fn steer(&self, steering: &Steering) -> Result<(), String>;
     /// How long steps took: first step of each stretch, and nanoseconds.
     fn latencies(&self) -> Vec<(u64, f32)>;
 }

@@ -13,7 +13,7 @@ use axum::middleware::{self, Next};
 use axum::response::{IntoResponse, Response};
 use axum::routing::{get, post};
 use axum::{Json, Router};
-use control_zones::process::Order;
+use control_zones::process::Steering;
 use serde::Deserialize;
 use serde_json::{Value, json};
 use std::io;
@@ -213,10 +213,10 @@ fn frames(run: &Run, from: u64, count: u64) -> Vec<u8> {
 async fn steer(
     State(served): State<Arc<Served>>,
     Query(q): Query<Question>,
-    Json(order): Json<Order>,
+    Json(steering): Json<Steering>,
 ) -> Response {
     let live = served.runs.get(q.run).and_then(|run| run.live.as_ref());
-    match live.map(|live| live.steer(&order)) {
+    match live.map(|live| live.steer(&steering)) {
         Some(Ok(())) => Json(json!({ "is_done": true })).into_response(),
         Some(Err(reason)) => (StatusCode::CONFLICT, reason + "\n").into_response(),
         None => (StatusCode::CONFLICT, "a recording cannot be steered\n").into_response(),

@@ -2,7 +2,7 @@
 
 use crate::live::open;
 use clap::Parser;
-use control_zones::process::{Notice, Order, Place, Watched};
+use control_zones::process::{Notice, Place, Steering, Watched};
 use control_zones::scenario::Scenario;
 use control_zones::step::Step;
 use control_zones::transport::iox::{Condition, RunName, clean};
@@ -111,8 +111,8 @@ fn live(terminal: &mut ratatui::DefaultTerminal, watched: &Watched, board: &mut 
             {
                 match board.key(key) {
                     Reaction::End => return Ok(()),
-                    Reaction::Steer(order) => {
-                        watched.order(&order).map_err(|error| error.to_string())?;
+                    Reaction::Steer(wish) => {
+                        watched.steer(&wish).map_err(|error| error.to_string())?;
                     }
                     Reaction::None => {}
                 }
@@ -125,7 +125,7 @@ fn live(terminal: &mut ratatui::DefaultTerminal, watched: &Watched, board: &mut 
 #[derive(Debug, PartialEq)]
 enum Reaction {
     End,
-    Steer(Order),
+    Steer(Steering),
     None,
 }
 
@@ -306,12 +306,16 @@ impl Board {
         match key.code {
             KeyCode::Char('q') | KeyCode::Esc => Reaction::End,
             KeyCode::Char('c') if key.modifiers.contains(KeyModifiers::CONTROL) => Reaction::End,
-            KeyCode::Char(' ') => steer(if self.notice.is_paused { Order::Resume } else { Order::Pause }),
-            KeyCode::Char('s') => steer(Order::Step(1)),
-            KeyCode::Char('+') => {
-                steer(Order::Pace(if pace == 0.0 { 1.0 } else { (pace * 2.0).min(1000.0) }))
+            KeyCode::Char(' ') => {
+                steer(if self.notice.is_paused { Steering::Resume } else { Steering::Pause })
             }
-            KeyCode::Char('-') => steer(Order::Pace(if pace == 0.0 { 1.0 } else { (pace / 2.0).max(0.01) })),
+            KeyCode::Char('s') => steer(Steering::Step(1)),
+            KeyCode::Char('+') => {
+                steer(Steering::Pace(if pace == 0.0 { 1.0 } else { (pace * 2.0).min(1000.0) }))
+            }
+            KeyCode::Char('-') => {
+                steer(Steering::Pace(if pace == 0.0 { 1.0 } else { (pace / 2.0).max(0.01) }))
+            }
             _ => Reaction::None,
         }
     }
@@ -549,11 +553,11 @@ mod tests {
         assert_eq!(board.key(press(KeyCode::Char('q'))), Reaction::End);
         assert_eq!(board.key(press(KeyCode::Char(' '))), Reaction::None);
         board.notice.is_steered = true;
-        assert_eq!(board.key(press(KeyCode::Char(' '))), Reaction::Steer(Order::Pause));
+        assert_eq!(board.key(press(KeyCode::Char(' '))), Reaction::Steer(Steering::Pause));
         board.notice.is_paused = true;
-        assert_eq!(board.key(press(KeyCode::Char(' '))), Reaction::Steer(Order::Resume));
-        assert_eq!(board.key(press(KeyCode::Char('s'))), Reaction::Steer(Order::Step(1)));
+        assert_eq!(board.key(press(KeyCode::Char(' '))), Reaction::Steer(Steering::Resume));
+        assert_eq!(board.key(press(KeyCode::Char('s'))), Reaction::Steer(Steering::Step(1)));
         board.notice.pace = 1.0;
-        assert_eq!(board.key(press(KeyCode::Char('+'))), Reaction::Steer(Order::Pace(2.0)));
+        assert_eq!(board.key(press(KeyCode::Char('+'))), Reaction::Steer(Steering::Pace(2.0)));
     }
 }

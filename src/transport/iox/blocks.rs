@@ -126,29 +126,29 @@ impl RunSpace {
     }
 }
 
-/// Bytes of an order at most.
+/// Bytes of one message at most.
 const MOST_ORDER_BYTES: usize = 256;
 /// Orders that may wait to be taken, and processes that may give some.
 const WAITING_ORDERS: usize = 16;
 const GIVERS: usize = 2;
 
-/// Where orders come in: a few bytes each, from whoever has opened the other end.
+/// Where a run is steered from outside: messages of a few bytes, from whoever has opened the other end.
 #[derive(Debug)]
-pub struct OrderInbox {
+pub struct SteeringInbox {
     service: String,
     subscriber: Subscriber<ipc::Service, [u8], ()>,
     _factory: PortFactory<ipc::Service, [u8], ()>,
 }
 
-/// Where orders are given.
+/// The other end: where they are sent.
 #[derive(Debug)]
-pub struct OrderOutbox {
+pub struct SteeringOutbox {
     service: String,
     publisher: Publisher<ipc::Service, [u8], ()>,
 }
 
-impl OrderInbox {
-    /// A copy of the next order, if there is one.
+impl SteeringInbox {
+    /// A copy of the next message, if there is one.
     pub fn receive(&self) -> Result<Option<Vec<u8>>, TransportError> {
         match self.subscriber.receive() {
             Ok(sample) => Ok(sample.map(|sample| sample.payload().to_vec())),
@@ -157,20 +157,20 @@ impl OrderInbox {
     }
 }
 
-impl OrderOutbox {
-    /// Gives an order.
-    pub fn send(&self, order: &[u8]) -> Result<(), TransportError> {
+impl SteeringOutbox {
+    /// Sends a message.
+    pub fn send(&self, message: &[u8]) -> Result<(), TransportError> {
         let failed = |reason: String| TransportError::Failed { service: self.service.clone(), reason };
-        let mut sample = self.publisher.loan_slice(order.len()).map_err(|e| failed(format!("{e:?}")))?;
-        sample.payload_mut().copy_from_slice(order);
+        let mut sample = self.publisher.loan_slice(message.len()).map_err(|e| failed(format!("{e:?}")))?;
+        sample.payload_mut().copy_from_slice(message);
         sample.send().map_err(|e| failed(format!("{e:?}")))?;
         Ok(())
     }
 }
 
 impl RunSpace {
-    /// Creates a service for orders.
-    pub fn create_orders(&self, name: &str) -> Result<OrderInbox, SpaceError> {
+    /// Creates a service for steering.
+    pub fn create_steering(&self, name: &str) -> Result<SteeringInbox, SpaceError> {
         let factory = self
             .node()
             .service_builder(&service_name(name)?)
@@ -186,11 +186,11 @@ impl RunSpace {
             .subscriber_builder()
             .create()
             .map_err(|e| failed(&format!("create a subscriber of {name}"), &e))?;
-        Ok(OrderInbox { service: name.to_owned(), subscriber, _factory: factory })
+        Ok(SteeringInbox { service: name.to_owned(), subscriber, _factory: factory })
     }
 
-    /// Opens the end at which orders are given; `None` when there is no such service.
-    pub fn open_orders(&self, name: &str) -> Result<Option<OrderOutbox>, SpaceError> {
+    /// Opens the end from which a run is steered; `None` when there is no such service.
+    pub fn open_steering(&self, name: &str) -> Result<Option<SteeringOutbox>, SpaceError> {
         let Ok(factory) =
             self.node().service_builder(&service_name(name)?).publish_subscribe::<[u8]>().open()
         else {
@@ -201,6 +201,6 @@ impl RunSpace {
             .initial_max_slice_len(MOST_ORDER_BYTES)
             .create()
             .map_err(|e| failed(&format!("create a publisher of {name}"), &e))?;
-        Ok(Some(OrderOutbox { service: name.to_owned(), publisher }))
+        Ok(Some(SteeringOutbox { service: name.to_owned(), publisher }))
     }
 }

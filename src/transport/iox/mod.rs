@@ -11,7 +11,7 @@ mod space;
 mod watchdog;
 
 pub use bell::{Bell, BellRope, Bells, monotonic_ns};
-pub use blocks::{Block, BlockInbox, BlockOutbox, OrderInbox, OrderOutbox};
+pub use blocks::{Block, BlockInbox, BlockOutbox, SteeringInbox, SteeringOutbox};
 pub use error::SpaceError;
 pub use leftovers::{Condition, Leftover, clean, sweep_dead_runs};
 pub use name::{RunName, RunNameError};
