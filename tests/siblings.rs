@@ -5,6 +5,11 @@
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::Mutex;
+
+/// A program that is still open for writing cannot be started, and a process being started by one thread still
+/// has open what another is writing; so the tests write and start one at a time.
+static ALONE: Mutex<()> = Mutex::new(());
 
 /// A `cz` in a directory of its own, with nothing beside it.
 fn alone(directory: &Path) -> PathBuf {
@@ -25,6 +30,7 @@ fn run(program: &Path, arguments: &[&str]) -> Output {
 
 #[test]
 fn a_program_that_is_not_there_is_named_with_what_makes_it() {
+    let _alone = ALONE.lock();
     let directory = tempfile::tempdir().unwrap();
     let output = run(&alone(directory.path()), &["report", "a.czlog"]);
     let said = String::from_utf8(output.stderr).unwrap();
@@ -34,6 +40,7 @@ fn a_program_that_is_not_there_is_named_with_what_makes_it() {
 
 #[test]
 fn arguments_and_exit_code_go_through_as_they_are() {
+    let _alone = ALONE.lock();
     let directory = tempfile::tempdir().unwrap();
     let program = alone(directory.path());
     let sibling = directory.path().join("cz-export");
