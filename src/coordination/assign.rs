@@ -55,7 +55,7 @@ impl Assigner {
             self.rows.push(row(scenario, &members[at], (left + rank) as u32));
         }
         self.coming.clear();
-        if scene.is_tandem() {
+        if scene.expects_in_order() {
             scene.coming(&mut self.coming);
             let first = self.rows.len() as u32;
             self.rows.extend(self.coming.iter().zip(first..).map(|(told, id)| scene.told_row(told, id)));

@@ -5,10 +5,10 @@ use super::cost::{Convex, Cost, Single, Tandem};
 use super::pooling::root;
 use crate::conflict::{Conflicts, Duties, Row};
 use crate::coordination::assign::row;
-use crate::scenario::{CoordinationParams, Scenario, ScheduleKind, VehicleParams, ZoneId};
+use crate::scenario::{CoordinationParams, PassingOrder, Scenario, ScheduleKind, VehicleParams, ZoneId};
 use ipc_schemas::{NO_VEHICLE, SUMMARY_COMING, VehicleState, ZoneSummary};
 
-/// Followers that are there already weigh less: they are scheduled themselves.
+/// What the time of those that others come behind weighs more, as a share of the price: these are scheduled themselves.
 const PRICE_WHEN_FOLLOWED: f64 = 0.3;
 /// How often the schedules of two zones are worked out in turn.
 const EXCHANGES: u32 = 2;
@@ -62,7 +62,6 @@ pub(in crate::coordination) struct Scheduler {
     passages: Vec<Passage>,
     /// Weight of time of each that is scheduled.
     betas: Vec<f64>,
-    followed: Vec<bool>,
     times_s: Vec<f64>,
     beyond: Beyond,
 }
@@ -91,6 +90,13 @@ impl Scene<'_> {
     /// Whether neighbouring zones' vehicles are scheduled together.
     pub(in crate::coordination) fn is_tandem(&self) -> bool {
         self.params().schedule == ScheduleKind::Tandem
+    }
+
+    /// Whether those that are about to come are scheduled together with the zone's own: in tandem, where they will pass
+    /// in order of entry. Where newcomers may be put ahead of others their place is not known before they are there.
+    pub(in crate::coordination) fn expects_in_order(&self) -> bool {
+        let zone = &self.scenario.network.zones[self.slice[0].zone as usize];
+        self.is_tandem() && zone.order == PassingOrder::Fifo
     }
 
     fn params(&self) -> &CoordinationParams {
@@ -187,15 +193,10 @@ impl Scheduler {
 
     /// Passages and costs of this zone alone.
     fn prepare(&mut self, scene: &Scene<'_>, queue: &Queue<'_>) {
-        let Scheduler { costs, passages, betas, followed, .. } = self;
-        let Queue { rows, at, duties, coming } = *queue;
+        let Scheduler { costs, passages, betas, .. } = self;
+        let Queue { rows, at, coming, .. } = *queue;
         let left = queue.left();
         let beta = scene.scenario.beta;
-        followed.clear();
-        followed.resize(rows.len(), false);
-        for duty in (left..rows.len()).flat_map(|place| duties.of(place)) {
-            followed[duty.partner as usize] = true;
-        }
         passages.clear();
         costs.clear();
         betas.clear();
@@ -212,7 +213,8 @@ impl Scheduler {
             if place < left {
                 continue;
             }
-            let share = if followed[place] { PRICE_WHEN_FOLLOWED } else { 1.0 };
+            // Where several paths cross, many may have nobody behind them; newcomers wait for the last alone.
+            let share = if place + 1 == rows.len() { 1.0 } else { PRICE_WHEN_FOLLOWED };
             let weighed = beta * (1.0 + share * scene.params().price_of_time);
             betas.push(weighed);
             let (left_m, v_mps) = (passage.left_m(), passage.v_mps);
