@@ -148,7 +148,7 @@ fn pairs_that_merge_cost_at_least_their_bound() {
         let mut courses = sample.courses();
         let mut orders = Vec::new();
         for _ in 0..2 {
-            let found = joint::seek(&traffic, &courses).unwrap();
+            let found = joint::seek(&traffic, &courses, f64::INFINITY).unwrap();
             assert!(found.missed_s < 1e-3, "{found:?}");
             orders.push(found.total);
             // The other order: whoever passed first comes to pass last.

@@ -183,7 +183,13 @@ fn the_centralised_optimum_lies_between() {
         let sample = Sample::of(&scenario, "paper").unwrap();
         let entrants = sample.entrants();
         let traffic = Traffic { scenario: &scenario, entrants: &entrants };
-        let found = joint::seek(&traffic, &sample.courses()).unwrap();
+        let found = joint::seek(&traffic, &sample.courses(), f64::INFINITY).unwrap();
+        // Of no more exposure: dearer, as there is more to make up for.
+        let exposure_ms = |found: &joint::Found| found.exposure_ms.iter().sum::<f64>();
+        let most_ms = 0.9 * exposure_ms(&found);
+        let safer = joint::seek(&traffic, &sample.courses(), most_ms).unwrap();
+        assert!(exposure_ms(&safer) <= most_ms, "{found:?} {safer:?}");
+        assert!(most_ms == 0.0 || safer.total > found.total, "{found:?} {safer:?}");
         let alone = traffic.alone().total;
         assert!(alone < found.total && found.total < sample.total(), "{alone} {found:?} {}", sample.total());
         assert!(found.missed_s < 0.02, "{found:?}");
@@ -201,7 +207,7 @@ fn the_centralised_optimum_lies_between() {
     let sample = Sample::of(&scenario, "paper").unwrap();
     let entrants = sample.entrants();
     let traffic = Traffic { scenario: &scenario, entrants: &entrants };
-    let found = joint::seek(&traffic, &sample.courses()).unwrap();
+    let found = joint::seek(&traffic, &sample.courses(), f64::INFINITY).unwrap();
     let alone = traffic.alone().total;
     assert!(
         found.converged && found.total >= alone - 1e-6 && found.total < 1.003 * alone,
@@ -210,5 +216,5 @@ fn the_centralised_optimum_lies_between() {
     // A link behind a zone: not a chain of merges.
     let scenario = load(Some("tree"), &[], Some(1)).unwrap();
     let traffic = Traffic { scenario: &scenario, entrants: &[] };
-    assert_eq!(joint::seek(&traffic, &[]), None);
+    assert_eq!(joint::seek(&traffic, &[], 1.0), None);
 }

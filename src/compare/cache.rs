@@ -62,7 +62,8 @@ impl Cache {
                 return Ok(None);
             }
             let entrants = sample.entrants();
-            Ok(joint::seek(&Traffic { scenario, entrants: &entrants }, &sample.courses()))
+            let exposure_ms = sample.zones.iter().map(|zone| zone.exposure_ms).sum();
+            Ok(joint::seek(&Traffic { scenario, entrants: &entrants }, &sample.courses(), exposure_ms))
         })
     }
 

@@ -4,7 +4,8 @@
 //! driven exactly, and instants follow from speeds. Cost is the sum of the zones' mean costs. Toward the vehicle
 //! ahead on the same path, at each place, and toward the one that passes a merge before it, at its own passing, a
 //! vehicle keeps `phi v + delta`, as instants: it is nowhere before the other was that far ahead. A vehicle that comes
-//! in closer than that may stay closer for a while, by as much as decays at `RECOVERY_PER_S`.
+//! in closer than that may stay closer for a while, by as much as decays at a rate, the least of `RECOVERIES_PER_S` at which it is
+//! not more exposed than what it is compared with.
 //!
 //! Cost is nearly convex in the speeds, instants are not: a sequence of quadratic programs (`program`), each
 //! within a trust region, with an exact penalty. What it ends in is a **local** optimum, with speeds that anybody
@@ -18,8 +19,8 @@ use program::{Step, step};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Rate at which missing distance must be made up, 1/s.
-const RECOVERY_PER_S: f64 = 0.6;
+/// Rates at which missing distance must be made up, 1/s.
+const RECOVERIES_PER_S: [f64; 7] = [0.6, 0.7, 0.8, 0.9, 1.0, 1.25, 1.6];
 /// Length of the stretches of constant acceleration, about, m.
 const STRETCH_M: f64 = 12.5;
 /// Programs at most.
@@ -99,16 +100,33 @@ pub(super) struct Problem {
     vehicle: VehicleParams,
     beta: f64,
     penalty: f64,
+    /// Rate at which missing distance must be made up, 1/s.
+    recovery_per_s: f64,
 }
 
 /// Seeks the optimum for the order in which the courses pass; `None` where the network has anything but merges
 /// without links, or several kinds of vehicles.
-pub fn seek(traffic: &Traffic<'_>, courses: &[Vec<Course>]) -> Option<Found> {
+///
+/// Who may stay too close for longer has less to do: the optimum is that of the least recovery at which its exposure, per
+/// vehicle and over all zones, is at most `most_exposure_ms`, m s, or else that of the greatest.
+pub fn seek(traffic: &Traffic<'_>, courses: &[Vec<Course>], most_exposure_ms: f64) -> Option<Found> {
+    let mut found = None;
+    for recovery_per_s in RECOVERIES_PER_S {
+        found = seek_at(traffic, courses, recovery_per_s);
+        let exposure_ms = found.as_ref()?.exposure_ms.iter().sum::<f64>();
+        if exposure_ms <= most_exposure_ms {
+            break;
+        }
+    }
+    found
+}
+
+fn seek_at(traffic: &Traffic<'_>, courses: &[Vec<Course>], recovery_per_s: f64) -> Option<Found> {
     let scenario = traffic.scenario;
     if !scenario.network.zones.iter().all(is_merge) || scenario.fleet.len() != 1 {
         return None;
     }
-    let mut problem = Problem::new(traffic, courses);
+    let mut problem = Problem::new(traffic, courses, recovery_per_s);
     let (mut merit, mut radius_mps, mut steps, mut converged) = (problem.merit(), RADII_MPS.0, 0, false);
     let mut prices: Vec<Vec<f64>> = problem.drives.iter().map(|d| d.price(problem.beta)).collect();
     while steps < MOST_STEPS && radius_mps > RADII_MPS.2 {
@@ -139,7 +157,7 @@ pub fn seek(traffic: &Traffic<'_>, courses: &[Vec<Course>]) -> Option<Found> {
 }
 
 impl Problem {
-    fn new(traffic: &Traffic<'_>, courses: &[Vec<Course>]) -> Problem {
+    fn new(traffic: &Traffic<'_>, courses: &[Vec<Course>], recovery_per_s: f64) -> Problem {
         let scenario = traffic.scenario;
         // Weights near one, whatever the number of vehicles.
         let many = traffic.entrants.len() as f64;
@@ -201,7 +219,8 @@ impl Problem {
         }
         let beta = scenario.beta;
         let greatest = shares.iter().fold(0.0, |a: f64, b| a.max(*b));
-        Problem { drives, owes, vehicle: scenario.vehicle, beta, penalty: PENALTY * beta * greatest }
+        let penalty = PENALTY * beta * greatest;
+        Problem { drives, owes, vehicle: scenario.vehicle, beta, penalty, recovery_per_s }
     }
 
     fn set(&mut self, speeds_mps: &[Vec<f64>]) {
@@ -222,7 +241,8 @@ impl Problem {
         let other = &self.drives[owes.to];
         let there_m = other.position_m(own.instants_s[since]) - owes.shift_m - own.places_m[since];
         let missing_m = (distance_m(since) - there_m).max(0.0);
-        target_m - missing_m * (-RECOVERY_PER_S * (own.instants_s[owes.place] - own.instants_s[since])).exp()
+        target_m
+            - missing_m * (-self.recovery_per_s * (own.instants_s[owes.place] - own.instants_s[since])).exp()
     }
 
     /// Time to spare, s.
