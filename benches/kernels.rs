@@ -53,8 +53,8 @@ fn motion(c: &mut Criterion) {
 }
 
 fn run(c: &mut Criterion) {
-    let scenario = Arc::new(load_embedded("two-merges", &[], Some(1)).expect("the scenario is embedded"));
-    c.bench_function("run/two-merges, all roles in one process", |b| {
+    let scenario = Arc::new(load_embedded("paper", &[], Some(1)).expect("the scenario is embedded"));
+    c.bench_function("run/paper, all roles in one process", |b| {
         b.iter(|| InProcess::new(&scenario, 1, 1).run().expect("the embedded scenario runs to its end"));
     });
     c.bench_function("encode/scenario", |b| b.iter(|| encode(black_box(&scenario))));

@@ -21,7 +21,7 @@ struct Fate {
     victim: Option<(&'static str, Duration)>,
 }
 
-/// State hashes of `two-merges`, by seed from 1; see `run_hashes.rs`.
+/// State hashes of `paper`, by seed from 1; see `run_hashes.rs`.
 const GOLDEN: [&str; 3] = ["b56ea7e351b4a6a2", "204eba1f547116eb", "58b2783c8587e258"];
 
 /// A third of the runs lose their supervisor, world or controller, at a moment drawn.
@@ -58,7 +58,7 @@ fn kill(supervisor: &Process, victim: &str) {
 fn live(site: &Site, fate: &Fate) -> Ended {
     let seed = fate.seed.to_string();
     let arguments =
-        ["two-merges", "--seed", &seed, "--json", "-", "--peer-timeout", "60", "--attach-timeout", "60"];
+        ["paper", "--seed", &seed, "--json", "-", "--peer-timeout", "60", "--attach-timeout", "60"];
     let supervisor = site.start_in("cz", &fate.run, &arguments);
     if let Some((victim, delay)) = fate.victim {
         std::thread::sleep(delay);

@@ -22,7 +22,7 @@ fn a_vehicle_that_passes_another_is_in_table_json_and_stderr() {
     let site = Site::new("overlap");
     let arguments = [
         "run",
-        "two-merges",
+        "paper",
         "--in-process",
         "--seed",
         "3",

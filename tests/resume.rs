@@ -242,7 +242,7 @@ fn a_branch_shares_the_past_and_not_the_future() {
         let path = file.to_str().unwrap();
         cz(&site, &["branch", path, "--at", at, "--set", set, "--json"])
     };
-    let output = branch("1500", "zones.merge-1.flow.gain_mps=0.6");
+    let output = branch("1500", "coordination.price_of_time=0");
     assert!(output.status.success(), "{output:?}");
     let both: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
     let hash = |name: &str| format!("{:016x}", both[name]["state_hash"].as_u64().unwrap());

@@ -84,7 +84,7 @@ const EVERYTHING: [&str; 4] = [
 fn a_controller_cannot_claim_the_worlds_own_verdicts() {
     // What the world puts in after a missed deadline is neither lost nor silenced; who claims to be the world
     // does not get away with it.
-    let scenario = scenario("two-merges", 1, &["faults.commands={loss=1.0}"]);
+    let scenario = scenario("paper", 1, &["faults.commands={loss=1.0}"]);
     let mut world = World::new(scenario, 1);
     while !world.records().any(|r| is_member(&r)) {
         world.command(0, &[]).unwrap();
@@ -200,7 +200,7 @@ fn another_seed_draws_other_faults() {
     let sets: Vec<&str> = trace.iter().map(String::as_str).collect();
     let hash = |seed, more: &[&str]| {
         let sets = [&sets[..], &["end.vehicles=30"], more].concat();
-        built_in(&scenario("two-merges", seed, &sets)).state_hash
+        built_in(&scenario("paper", seed, &sets)).state_hash
     };
     assert_eq!(hash(1, &[]), hash(2, &[]));
     for fault in [EVERYTHING[0], EVERYTHING[1], EVERYTHING[2]] {
@@ -222,11 +222,11 @@ fn faults_of_no_size_change_no_hash() {
         "faults.sensors=[{kind=\"bias\",position_m=0},{kind=\"frozen\",from_s=1e6}]",
         "faults.stalls=[{from_s=1e6}]",
     ];
-    let summary = built_in(&scenario("two-merges", 1, &sets));
+    let summary = built_in(&scenario("paper", 1, &sets));
     assert_eq!(format!("{:016x}", summary.state_hash), "b56ea7e351b4a6a2", "see tests/run_hashes.rs");
     let records_noisy = counts(&summary).records_noisy;
     assert_eq!(counts(&summary), FaultCounts { records_noisy, ..biased(&summary) });
-    assert_eq!(built_in(&scenario("two-merges", 1, &["faults={}"])).faults, None);
+    assert_eq!(built_in(&scenario("paper", 1, &["faults={}"])).faults, None);
 }
 
 fn biased(summary: &WorldSummary) -> FaultCounts {
@@ -235,9 +235,9 @@ fn biased(summary: &WorldSummary) -> FaultCounts {
 
 #[test]
 fn noise_is_added_to_every_record() {
-    let truth = scripted_run(&scenario("two-merges", 1, &[]), 1500).0;
+    let truth = scripted_run(&scenario("paper", 1, &[]), 1500).0;
     let noise = "faults.noise={position_sd_m=0.5,speed_sd_mps=0.2}";
-    let (said, summary) = scripted_run(&scenario("two-merges", 1, &[noise]), 1500);
+    let (said, summary) = scripted_run(&scenario("paper", 1, &[noise]), 1500);
     let (mut n, mut sums, mut squares) = (0.0, [0.0; 2], [0.0; 2]);
     for (truth, said) in truth.iter().zip(&said) {
         assert!(truth.keys().eq(said.keys()));
@@ -266,10 +266,10 @@ fn noise_is_added_to_every_record() {
 
 #[test]
 fn a_vehicle_has_one_error_wherever_it_is_listed() {
-    let truth = scripted_run(&scenario("two-merges", 1, &[]), 900).0;
-    let said = scripted_run(&scenario("two-merges", 1, &[EVERYTHING[0]]), 900).0;
+    let truth = scripted_run(&scenario("paper", 1, &[]), 900).0;
+    let said = scripted_run(&scenario("paper", 1, &[EVERYTHING[0]]), 900).0;
     // With fewer vehicles on the road the draws of the rest stay the same.
-    let fewer = scripted_run(&scenario("two-merges", 1, &[EVERYTHING[0], "end.vehicles=20"]), 900).0;
+    let fewer = scripted_run(&scenario("paper", 1, &[EVERYTHING[0], "end.vehicles=20"]), 900).0;
     let (mut twice, mut shared) = (0, 0);
     for ((truth, said), fewer) in truth.iter().zip(&said).zip(&fewer) {
         for (&(zone, vehicle), record) in said {
@@ -291,8 +291,8 @@ fn a_vehicle_has_one_error_wherever_it_is_listed() {
 #[test]
 fn a_bias_shifts_what_is_published_by_exactly_that() {
     let bias = "faults.sensors=[{kind=\"bias\",zones=[\"merge-1\"],from_s=30,until_s=60,position_m=-2.5,speed_mps=0.75}]";
-    let truth = scripted_run(&scenario("two-merges", 1, &[]), 900).0;
-    let (said, summary) = scripted_run(&scenario("two-merges", 1, &[bias]), 900);
+    let truth = scripted_run(&scenario("paper", 1, &[]), 900).0;
+    let (said, summary) = scripted_run(&scenario("paper", 1, &[bias]), 900);
     let mut struck = 0;
     for (step, (truth, said)) in truth.iter().zip(&said).enumerate() {
         for (key, truth) in truth {
@@ -306,15 +306,15 @@ fn a_bias_shifts_what_is_published_by_exactly_that() {
     assert_eq!(counts(&summary), FaultCounts { records_biased: struck, ..FaultCounts::default() });
     // A speed that would be negative is 0.
     let slow = "faults.sensors=[{kind=\"bias\",speed_mps=-1000}]";
-    let said = scripted_run(&scenario("two-merges", 1, &[slow]), 400).0;
+    let said = scripted_run(&scenario("paper", 1, &[slow]), 400).0;
     assert!(said.iter().flat_map(|f| f.values()).all(|r| r.v_mps.to_bits() == 0));
 }
 
 #[test]
 fn a_fraction_of_the_vehicles_is_the_same_for_life() {
     let bias = "faults.sensors=[{kind=\"bias\",fraction=0.3,position_m=1}]";
-    let truth = scripted_run(&scenario("two-merges", 1, &[]), 4000).0;
-    let said = scripted_run(&scenario("two-merges", 1, &[bias]), 4000).0;
+    let truth = scripted_run(&scenario("paper", 1, &[]), 4000).0;
+    let said = scripted_run(&scenario("paper", 1, &[bias]), 4000).0;
     let mut is_struck = BTreeMap::new();
     for (truth, said) in truth.iter().zip(&said) {
         for (key, truth) in truth {
@@ -333,8 +333,8 @@ fn a_frozen_sensor_repeats_what_it_said_first() {
     let frozen =
         "faults.sensors=[{kind=\"frozen\",paths=[\"merge-1.main\",\"merge-2.merge\"],from_s=30,until_s=60}]";
     let noise = EVERYTHING[0];
-    let noisy = scripted_run(&scenario("two-merges", 1, &[noise]), 900).0;
-    let (said, summary) = scripted_run(&scenario("two-merges", 1, &[noise, frozen]), 900);
+    let noisy = scripted_run(&scenario("paper", 1, &[noise]), 900).0;
+    let (said, summary) = scripted_run(&scenario("paper", 1, &[noise, frozen]), 900);
     let mut first: BTreeMap<(u32, u32), VehicleState> = BTreeMap::new();
     let (mut struck, mut moved) = (0, 0);
     for (step, (noisy, said)) in noisy.iter().zip(&said).enumerate() {
@@ -374,7 +374,7 @@ fn each_step(frames: &[Frame], mut expected: impl FnMut(u64, &VehicleState) -> O
 
 #[test]
 fn without_faults_a_vehicle_does_as_it_is_told() {
-    let frames = scripted_run(&scenario("two-merges", 1, &[]), 500).0;
+    let frames = scripted_run(&scenario("paper", 1, &[]), 500).0;
     assert!(each_step(&frames, |step, r| Some(scripted(step, r.vehicle))) > 1000);
 }
 
@@ -383,7 +383,7 @@ fn a_vehicle_that_hears_nothing_keeps_its_acceleration() {
     let lost = "faults.commands={loss=1,from_s=20,until_s=40}";
     let stalled = "faults.stalls=[{from_s=20,until_s=40}]";
     for set in [lost, stalled] {
-        let (frames, summary) = scripted_run(&scenario("two-merges", 1, &[set]), 500);
+        let (frames, summary) = scripted_run(&scenario("paper", 1, &[set]), 500);
         let mut silent = 0;
         let checked = each_step(&frames, |step, r| {
             let is_silent = (200..400).contains(&step);
@@ -411,7 +411,7 @@ fn a_vehicle_that_hears_nothing_keeps_its_acceleration() {
 #[test]
 fn a_stall_reaches_its_paths_only() {
     let set = "faults.stalls=[{paths=[\"merge-1.merge\"],from_s=20,until_s=40}]";
-    let frames = scripted_run(&scenario("two-merges", 1, &[set]), 500).0;
+    let frames = scripted_run(&scenario("paper", 1, &[set]), 500).0;
     let checked = each_step(&frames, |step, r| {
         let is_silent = (200..400).contains(&step) && (r.zone, r.path) == (0, 1);
         Some(if is_silent { r.u_mps2 } else { scripted(step, r.vehicle) })
@@ -436,7 +436,7 @@ fn a_vehicle_at_full_speed_does_not_keep_accelerating() {
 #[test]
 fn a_late_command_comes_that_many_steps_later() {
     let set = "faults.commands={delay_steps=3}";
-    let (frames, summary) = scripted_run(&scenario("two-merges", 1, &[set]), 500);
+    let (frames, summary) = scripted_run(&scenario("paper", 1, &[set]), 500);
     let mut since: BTreeMap<(u32, u32), u64> = BTreeMap::new();
     let checked = each_step(&frames, |step, r| {
         // A command is for a vehicle in a zone: none is taken along into the next.
@@ -451,7 +451,7 @@ fn a_late_command_comes_that_many_steps_later() {
 #[test]
 fn an_older_command_never_overwrites_a_newer_one() {
     let set = "faults.commands={loss=0.2,delay_steps=4,delay_probability=0.5}";
-    let (frames, summary) = scripted_run(&scenario("two-merges", 1, &[set]), 4000);
+    let (frames, summary) = scripted_run(&scenario("paper", 1, &[set]), 4000);
     // The intent is the step of the command obeyed, plus 1.
     let mut obeyed: BTreeMap<(u32, u32), f64> = BTreeMap::new();
     let (mut at_once, mut late, mut held) = (0u64, 0u64, 0u64);

@@ -8,6 +8,7 @@ mod adversaries;
 mod shares;
 
 use adversaries::{always_u_max, leaders_that_stop, random_flips};
+use control_zones::coordination::Coordinator;
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{EntryRule, Override, PassingOrder, Scenario, load};
 use control_zones::world::{ShieldRow, World};
@@ -45,9 +46,15 @@ fn attack(
     mut adversary: impl FnMut(u64, &VehicleState) -> f64,
 ) -> (ShieldRow, u64, World) {
     let mut world = World::new(scenario.clone(), 1);
+    let mut coordinator = Coordinator::new(scenario.clone(), 0..scenario.network.zones.len() as u32);
     let mut commanded = 0;
     while commanded < steps && !world.is_finished() {
         let step = world.step();
+        if world.coordinator_masks().acting != 0 {
+            let states: Vec<VehicleState> = world.records().collect();
+            coordinator.act(step, &states);
+            world.coordinate(coordinator.assignments());
+        }
         let commands: Vec<VehicleCommand> = world
             .records()
             .filter(VehicleState::is_commanded)
@@ -94,17 +101,17 @@ fn withstands<A: FnMut(u64, &VehicleState) -> f64>(network: &str, adversary: imp
 
 #[test]
 fn withstands_full_acceleration() {
-    withstands("two-merges", always_u_max);
+    withstands("paper", always_u_max);
 }
 
 #[test]
 fn withstands_random_flips() {
-    withstands("two-merges", random_flips);
+    withstands("paper", random_flips);
 }
 
 #[test]
 fn withstands_leaders_that_stop() {
-    withstands("two-merges", leaders_that_stop);
+    withstands("paper", leaders_that_stop);
 }
 
 #[test]
@@ -115,25 +122,47 @@ fn withstands_them_in_a_tree_and_a_corridor() {
     }
 }
 
+/// More arrivals than a road carries, a gate, and a standstill gap: by default the vehicles' length.
+fn gated(network: &str, entry: EntryRule, gap_m: Option<f64>) -> Arc<Scenario> {
+    let base = scenario(network, "on", 1.2, 600.0, 1);
+    let mut scenario = (*base).clone();
+    scenario.network.roads.iter_mut().for_each(|road| road.entry = entry);
+    let fleet = scenario.fleet.iter_mut().map(|kind| &mut kind.vehicle);
+    for kind in fleet.chain([&mut scenario.vehicle]) {
+        kind.standstill_gap_m = gap_m.unwrap_or(kind.length_m);
+    }
+    Arc::new(scenario)
+}
+
+/// The default scenario under more demand, as it is otherwise, with the shield on.
+fn dense_default() -> Arc<Scenario> {
+    let own = load(None, &[], None).unwrap();
+    let mut dense = (*scenario("two-merges", "on", 1.2, 600.0, 1)).clone();
+    (dense.vehicle, dense.fleet) = (own.vehicle, own.fleet);
+    assert!(dense.network.roads.iter().all(|road| road.entry == EntryRule::Viable));
+    assert!(dense.network.zones.iter().all(|zone| zone.order == PassingOrder::Resequenced));
+    Arc::new(dense)
+}
+
 /// With a gate that lets in who is viable, approaches on which `v_max` can be braked off, and a standstill gap of a vehicle's
 /// length, nobody ever begins unsafe: no negative margin and no contact, for any controller (docs/control.md, T3).
+///
+/// The default scenario has these itself, and newcomers whom its coordinators put ahead of others.
 fn holds_for_everybody<A: FnMut(u64, &VehicleState) -> f64>(what: &str, adversary: impl Fn() -> A) {
-    for (network, steps) in [("two-merges", 400_000), ("corridor-8", 200_000), ("tree", 200_000)] {
-        let base = scenario(network, "on", 1.2, 600.0, 1);
-        let mut scenario = (*base).clone();
-        scenario.network.roads.iter_mut().for_each(|road| road.entry = EntryRule::Viable);
-        for kind in
-            std::iter::once(&mut scenario.vehicle).chain(scenario.fleet.iter_mut().map(|k| &mut k.vehicle))
-        {
-            kind.standstill_gap_m = kind.length_m;
-        }
+    for (network, steps) in
+        [("paper", 400_000), ("two-merges", 400_000), ("corridor-8", 200_000), ("tree", 200_000)]
+    {
+        let scenario = match network {
+            "two-merges" => dense_default(),
+            _ => gated(network, EntryRule::Viable, None),
+        };
         let v = &scenario.vehicle;
         let least_m =
             v.v_max_mps * v.v_max_mps / (2.0 * -v.u_min_mps2) + 0.05 + v.v_max_mps * scenario.dt_s();
         for path in scenario.network.zones.iter().flat_map(|zone| &zone.paths) {
             assert!(path.length_m >= least_m, "{network}: {} m", path.length_m);
         }
-        let (row, commanded, world) = attack(&Arc::new(scenario), steps, adversary());
+        let (row, commanded, world) = attack(&scenario, steps, adversary());
         let summary = world.summary();
         println!(
             "{what}, {network}: {commanded} vehicle-steps, {} bounded, {} held at the gate; {row:?}",
@@ -168,6 +197,20 @@ fn a_gate_makes_it_hold_for_everybody() {
     holds_for_everybody("leaders that stop", leaders_that_stop);
     holds_for_everybody("contrary", contrary);
     holds_for_everybody("waves", waves);
+}
+
+/// What is assumed of the gate and of the gap is needed: without either the same drivers do harm, shield or not.
+#[test]
+fn without_a_gate_or_a_gap_it_does_not_hold() {
+    for (entry, gap_m) in [(EntryRule::Free, None), (EntryRule::Viable, Some(0.0))] {
+        let (row, _, world) = attack(&gated("paper", entry, gap_m), 100_000, leaders_that_stop());
+        let overlaps = world.summary().overlaps;
+        println!("{entry:?}, gap {gap_m:?}: {row:?}, {overlaps:?}");
+        match entry {
+            EntryRule::Free => assert!(row.began_unsafe > 0),
+            _ => assert!(row.began_unsafe == 0 && overlaps.pairs > 0),
+        }
+    }
 }
 
 /// An embedded scenario under another rate on every road, until the given number of vehicles has come.
@@ -270,7 +313,7 @@ fn changes_nothing_when_nothing_is_violated() {
     let mut quiet = 0;
     for seed in 1..=20 {
         let with = |shield: &str| {
-            let base = scenario("two-merges", shield, 4.0, 120.0, seed);
+            let base = scenario("paper", shield, 4.0, 120.0, seed);
             built_in(&Arc::new(Scenario { max_vehicles: Some(60), ..(*base).clone() }))
         };
         let (off, observed) = (with("off"), with("observe"));
@@ -288,9 +331,9 @@ fn changes_nothing_when_nothing_is_violated() {
 #[test]
 fn values_beyond_the_limits_are_bounded_only_with_the_shield_on() {
     let wild = |step: u64, _: &VehicleState| if step.is_multiple_of(2) { f64::NAN } else { 1e9 };
-    let (row, commanded, _) = attack(&scenario("two-merges", "on", 2.2, 500.0, 1), 1000, wild);
+    let (row, commanded, _) = attack(&scenario("paper", "on", 2.2, 500.0, 1), 1000, wild);
     assert_eq!(row.not_finite + row.limits, commanded);
-    let mut world = World::new(scenario("two-merges", "off", 2.2, 500.0, 1), 1);
+    let mut world = World::new(scenario("paper", "off", 2.2, 500.0, 1), 1);
     while world.records().next().is_none() {
         world.command(0, &[]).unwrap();
         world.advance().unwrap();

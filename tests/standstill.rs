@@ -26,23 +26,23 @@ fn drive(scenario: Arc<Scenario>, rule: impl Fn(u64, &VehicleState) -> f64) -> W
     world.summary()
 }
 
-fn two_merges(sets: &[&str]) -> Arc<Scenario> {
+fn paper(sets: &[&str]) -> Arc<Scenario> {
     let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
-    Arc::new(load(Some("two-merges"), &sets, None).unwrap())
+    Arc::new(load(Some("paper"), &sets, None).unwrap())
 }
 
 /// Both zones come to a stop and stay so; it used to be two hours of simulated time and not a word.
 #[test]
 fn a_gridlock_under_the_shield_names_the_zones_and_since_when() {
-    let summary = drive(two_merges(&["shield=on", "end.time_s=600"]), |_, _| f64::NAN);
+    let summary = drive(paper(&["shield=on", "end.time_s=600"]), |_, _| f64::NAN);
     let stall = summary.stalled.iter().find(|s| s.zone == "merge-1").expect("merge-1 stands");
     assert!(stall.vehicles > 0 && stall.since_s < 60.0, "{stall:?}");
     assert_eq!(stall.since_s, stall.since_step as f64 * 0.1);
     // Nobody is said to stand who moves, or has left.
-    let fluent = drive(two_merges(&["shield=on", "end.vehicles=20"]), |_, _| 2.0);
+    let fluent = drive(paper(&["shield=on", "end.vehicles=20"]), |_, _| 2.0);
     assert_eq!((fluent.stalled, fluent.departed), (vec![], 20));
     // A minute is what it takes.
-    let early = drive(two_merges(&["shield=on", "end.time_s=70"]), |_, _| f64::NAN);
+    let early = drive(paper(&["shield=on", "end.time_s=70"]), |_, _| f64::NAN);
     assert_eq!(early.stalled, vec![]);
 }
 
@@ -50,14 +50,14 @@ fn a_gridlock_under_the_shield_names_the_zones_and_since_when() {
 #[test]
 fn a_command_that_is_changed_for_two_reasons_is_one_command() {
     for u in [f64::NAN, 1e9] {
-        let summary = drive(two_merges(&["shield=on", "end.time_s=200"]), |_, _| u);
+        let summary = drive(paper(&["shield=on", "end.time_s=200"]), |_, _| u);
         let row = &summary.shield.controllers[0];
         let reasons = row.not_finite + row.limits + row.speed + row.rear_end + row.merge;
         assert_eq!(row.bounded, row.commands, "every one was changed");
         assert!(u.is_nan() || reasons > row.commands, "{reasons} reasons for {} commands", row.commands);
     }
     // Where nothing is beyond the limits, a command has one reason at most.
-    let summary = drive(two_merges(&["shield=on", "end.time_s=200"]), |_, _| 4.0);
+    let summary = drive(paper(&["shield=on", "end.time_s=200"]), |_, _| 4.0);
     let row = &summary.shield.controllers[0];
     assert_eq!(row.bounded, row.speed + row.rear_end + row.merge);
 }

@@ -85,7 +85,7 @@ fn commands(world: &World, u_mps2: f64, planned_exit_time_s: f64) -> Vec<Vehicle
 }
 
 fn scenario() -> Arc<Scenario> {
-    Arc::new(load(Some("two-merges"), &["end.time_s=60".parse().unwrap()], None).unwrap())
+    Arc::new(load(Some("paper"), &["end.time_s=60".parse().unwrap()], None).unwrap())
 }
 
 /// Runs a world whose controller answers every step but each tenth, for which the world puts something in;

@@ -18,9 +18,11 @@ use control_zones::scenario::{LawKind, Override, Scenario, VehicleKind, load};
 use control_zones::shield::{self, Shield};
 use control_zones::vehicle::Held;
 use control_zones::world::WorldSummary;
+use ipc_schemas::{STATE_ENTERED, VERDICT_INFEASIBLE};
 use proptest::prelude::*;
 use random::Random;
 use shares::assert_one_hash;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 fn scenario(name: &str, sets: &[&str], seed: u64) -> Scenario {
@@ -48,7 +50,7 @@ fn at(time_s: f64, x_m: f64, v_mps: f64) -> Situation {
 fn first_tier(braking_mps2: f64) -> Scenario {
     let sets =
         ["control.viable.comfort=false", "control.viable.bodies=false", "vehicle.standstill_gap_m=0.5"];
-    let mut scenario = scenario("two-merges", &sets, 1);
+    let mut scenario = scenario("paper", &sets, 1);
     let mut harder = scenario.fleet[0].clone();
     harder.vehicle.u_min_mps2 = -braking_mps2;
     scenario.fleet.push(VehicleKind { name: "other".to_owned(), ..harder });
@@ -199,7 +201,7 @@ proptest! {
         x in 0.0..195.0f64, v in 0.0..30.0f64, t in 0.0..30.0f64, scheduled in prop_oneof![Just(0.0), 1.0..60.0f64],
         others in partners(),
     ) {
-        let scenario = scenario("two-merges", &[], 1);
+        let scenario = scenario("paper", &[], 1);
         let law = Viable::new(&scenario);
         let schedule = (scheduled > 0.0).then_some(Schedule { at_m: LENGTH_M, time_s: t + scheduled });
         let s = Situation { schedule, ..at(t, x, v) };
@@ -234,7 +236,7 @@ proptest! {
 
 #[test]
 fn a_schedule_is_met_to_the_step() {
-    let scenario = scenario("two-merges", &[], 1);
+    let scenario = scenario("paper", &[], 1);
     let law = Viable::new(&scenario);
     for (terminal, time_s, speed_mps) in [
         (Terminal::Free, 14.0, None),
@@ -263,7 +265,7 @@ fn a_schedule_is_met_to_the_step() {
 
 #[test]
 fn what_is_remembered_is_the_mode_and_where_a_search_begins() {
-    let scenario = scenario("two-merges", &[], 1);
+    let scenario = scenario("paper", &[], 1);
     let law = Viable::new(&scenario);
     let mut memory = Words::ENTERED;
     law.decide(&at(3.0, 20.0, 14.0), std::iter::empty(), &mut memory);
@@ -278,7 +280,7 @@ fn what_is_remembered_is_the_mode_and_where_a_search_begins() {
 
 #[test]
 fn every_row_has_its_verdict() {
-    let scenario = scenario("two-merges", &[], 1);
+    let scenario = scenario("paper", &[], 1);
     let law = Viable::new(&scenario);
     let verdict = |s: &Situation, partner: Partner| {
         let mut memory = Words::ENTERED;
@@ -320,7 +322,7 @@ fn it_costs_a_third_less_than_the_papers_best_on_the_papers_traffic() {
     let none = ["zones.merge-1.flow={policy=\"none\"}", "zones.merge-2.flow={policy=\"none\"}"];
     let mean = |sets: &[&str], check: &dyn Fn(u64, &WorldSummary)| {
         let of_seed = |seed| {
-            let scenario = scenario("two-merges", &[&none[..], sets].concat(), seed);
+            let scenario = scenario("paper", &[&none[..], sets].concat(), seed);
             let (beta, summary) = (scenario.beta, run(scenario));
             assert_eq!((summary.departed, summary.waiting), (120, 0));
             check(seed, &summary);
@@ -330,12 +332,12 @@ fn it_costs_a_third_less_than_the_papers_best_on_the_papers_traffic() {
     };
     let viable = mean(&["control.law=viable"], &|seed, summary| {
         println!("seed {seed}: {:#?}, {:?}", summary.zones, summary.overlaps);
-        assert_viable_kept("two-merges", summary);
+        assert_viable_kept("paper", summary);
         assert_eq!(summary.zones.iter().map(|z| z.infeasible_vehicles).sum::<u32>(), 0);
         assert_eq!(summary.overlaps.pairs, 0);
     });
     let gated = mean(&["control.law=viable", "gate.entry=viable"], &|_, summary| {
-        assert_viable_kept("two-merges", summary);
+        assert_viable_kept("paper", summary);
         assert!(summary.held_arrivals > 20 && summary.zones.iter().any(|z| z.mean_wait_s > 0.05));
         assert!(
             summary
@@ -438,4 +440,53 @@ fn one_hash_for_any_number_of_processes() {
         scenario.max_vehicles = Some(60);
         assert_one_hash(&Arc::new(scenario), &[(2, 1), (1, 2), (3, 3)], name);
     }
+}
+
+/// Who is never without a solution is who entered with one: a vehicle that meets an infeasible step came in so close that, had
+/// the one ahead braked fully, it would have run into it. A gate that asks for room to stop leaves nobody infeasible.
+#[test]
+fn whoever_is_infeasible_entered_without_room_to_stop() {
+    let flow = "zones.*.flow={policy=\"none\"}";
+    let sets = ["control.law=viable", "coordination.schedule=pooled", "coordination.order=resequenced", flow];
+    let mut found = 0;
+    for seed in [18, 112] {
+        let paper = Arc::new(scenario("paper", &sets, seed));
+        let bodies = Shield::of_bodies(&paper.vehicle, paper.dt_s());
+        let gap_m = paper.vehicle.length_m + paper.control.viable.clearance_m;
+        // By how much each could stop behind whoever was ahead of it on its path when it entered, m.
+        let mut slack_m = BTreeMap::new();
+        let mut run = InProcess::observed(&paper, 1, 1);
+        let mut more = true;
+        while more {
+            more = run.step().unwrap();
+            run.frames(|frames| {
+                for own in frames.state.iter().filter(|s| s.flags & STATE_ENTERED != 0) {
+                    let others = frames.state.iter().filter(|s| (s.zone, s.path) == (own.zone, own.path));
+                    let ahead = others.filter(|s| s.x_m > own.x_m).min_by(|a, b| a.x_m.total_cmp(&b.x_m));
+                    let slack = ahead.map_or(f64::INFINITY, |ahead| {
+                        let leader = shield::Partner {
+                            kind: DutyKind::RearEnd,
+                            at_m: LENGTH_M,
+                            gap_m,
+                            braking_mps2: -paper.vehicle.u_min_mps2,
+                            motion: Held::new(ahead.x_m, ahead.v_mps, 0.0),
+                        };
+                        bodies.state_slack_m(own.x_m, own.v_mps, &leader)
+                    });
+                    slack_m.insert((own.zone, own.vehicle), slack);
+                }
+                let commands = frames.commands.iter().flat_map(|sent| sent.records);
+                for command in commands.filter(|c| c.verdict == VERDICT_INFEASIBLE) {
+                    let slack = slack_m[&(command.zone, command.vehicle)];
+                    assert!(slack < 0.0, "seed {seed}: {command:?} with {slack} m to spare when it entered");
+                    found += 1;
+                }
+            })
+            .unwrap();
+        }
+        let gated = crate::run(scenario("paper", &[&sets[..], &["gate.entry=room_to_stop"]].concat(), seed));
+        assert_eq!(gated.zones.iter().map(|z| z.infeasible_vehicles).sum::<u32>(), 0, "seed {seed}");
+        assert_eq!((gated.departed, gated.overlaps.pairs), (120, 0), "seed {seed}");
+    }
+    assert!(found > 0, "nobody was infeasible: the seeds show nothing any more");
 }

@@ -45,7 +45,7 @@ fn near(value: &Value, expected: f64) -> bool {
 #[test]
 fn sumo_reads_floating_car_data() {
     for recording in
-        [Recording::of("two-merges", &["end.vehicles=40"]), Recording::of("corridor-8", &["end.vehicles=30"])]
+        [Recording::of("paper", &["end.vehicles=40"]), Recording::of("corridor-8", &["end.vehicles=30"])]
     {
         let Some(said) = read_back(&recording, Format::Fcd, "a.xml") else { return };
         assert_eq!(said["vehicles"], recording.summary.arrived, "{said}");
@@ -64,7 +64,7 @@ fn sumo_reads_floating_car_data() {
 
 #[test]
 fn sumo_reads_trips() {
-    let recording = Recording::of("two-merges", &["end.time_s=100"]);
+    let recording = Recording::of("paper", &["end.time_s=100"]);
     let Some(said) = read_back(&recording, Format::Tripinfo, "a.xml") else { return };
     assert_eq!(
         (&said["vehicles"], &said["arrived"]),
@@ -81,7 +81,7 @@ fn sumo_reads_trips() {
 
 #[test]
 fn sumo_reads_conflicts() {
-    let recording = Recording::of("two-merges", &["end.vehicles=60"]);
+    let recording = Recording::of("paper", &["end.vehicles=60"]);
     let Some(said) = read_back(&recording, Format::Ssm, "a.xml") else { return };
     assert!(said["conflicts"].as_u64() > Some(0), "dense traffic has conflicts: {said}");
     assert_eq!(said["spans_agree"], true);
@@ -97,7 +97,7 @@ fn polars_reads_tables() {
 
 #[test]
 fn pyarrow_reads_tables_with_units() {
-    let recording = Recording::of("two-merges", &["end.vehicles=40"]);
+    let recording = Recording::of("paper", &["end.vehicles=40"]);
     let Some(said) = read_back(&recording, Format::Parquet, "a") else { return };
     tables(&recording, &said);
     let unit = |name: &str| said["units"][name].as_str().unwrap().to_owned();
@@ -136,7 +136,7 @@ fn mcap_reads_scenes() {
 
 #[test]
 fn perfetto_reads_the_trace() {
-    let recording = Recording::of("two-merges", &["end.vehicles=40"]);
+    let recording = Recording::of("paper", &["end.vehicles=40"]);
     let Some(said) = read_back(&recording, Format::Perfetto, "a.perfetto-trace") else { return };
     assert_eq!((&said["wrong"], &said["open"]), (&serde_json::json!([]), &0.into()), "{said}");
     assert_eq!(said["vehicles"], recording.summary.departed);

@@ -29,8 +29,8 @@ fn page_of(recordings: &[&Recording], more: &[&str]) -> String {
 }
 
 #[test]
-fn the_page_of_the_default_scenario_is_small_whole_and_true() {
-    let recording = Recording::of("two-merges", &[]);
+fn the_page_of_a_run_is_small_whole_and_true() {
+    let recording = Recording::of("paper", &[]);
     let directory = recording.directory().join("figures");
     let page =
         page_of(&[&recording], &["--png", directory.to_str().unwrap(), "--svg", directory.to_str().unwrap()]);
@@ -106,7 +106,7 @@ fn in_a_browser(recording: &Recording, name: &str) {
 
 #[test]
 fn seeds_are_a_group_with_intervals_and_settings_are_compared() {
-    let run = |sets: &[&str], seed: u64| Recording::seeded("two-merges", sets, Some(seed));
+    let run = |sets: &[&str], seed: u64| Recording::seeded("paper", sets, Some(seed));
     let short = "end.vehicles=30";
     let fixed = "zones.merge-1.flow={policy=\"fixed\",terminal_mps=12}";
     let recordings = [run(&[short], 1), run(&[short], 2), run(&[short, fixed], 1), run(&[short, fixed], 2)];
@@ -127,7 +127,7 @@ fn seeds_are_a_group_with_intervals_and_settings_are_compared() {
 
 #[test]
 fn a_recording_that_was_cut_off_is_reported_as_far_as_it_goes() {
-    let recording = Recording::of("two-merges", &["end.vehicles=20"]);
+    let recording = Recording::of("paper", &["end.vehicles=20"]);
     let bytes = std::fs::read(&recording.path).unwrap();
     std::fs::write(&recording.path, &bytes[..bytes.len() / 2]).unwrap();
     let page = page_of(&[&recording], &[]);
@@ -145,7 +145,7 @@ fn a_recording_that_was_cut_off_is_reported_as_far_as_it_goes() {
 
 #[test]
 fn what_is_no_recording_or_no_summary_is_refused_in_a_line() {
-    let recording = Recording::of("two-merges", &["end.time_s=10"]);
+    let recording = Recording::of("paper", &["end.time_s=10"]);
     let directory = recording.directory();
     std::fs::write(directory.join("other.json"), "{\"processes\":1}").unwrap();
     let file = recording.path.to_str().unwrap();

@@ -13,7 +13,7 @@ pub static RUN: LazyLock<(Metadata, Vec<Step>)> = LazyLock::new(|| {
         .iter()
         .map(|set| set.parse().expect("the set is well formed"))
         .collect();
-    let scenario = Arc::new(load(Some("two-merges"), &sets, None).expect("the scenario is embedded"));
+    let scenario = Arc::new(load(Some("paper"), &sets, None).expect("the scenario is embedded"));
     let processes = Processes { coordinators: 2, controllers: 2 };
     let mut metadata = Metadata::new(&scenario, ScenarioSource::default(), InProcess::RUN_ID, processes);
     metadata.created_unix_s = 0;

@@ -4,13 +4,13 @@ use crate::conflict::DutyKind;
 use crate::control::Terminal;
 use crate::control::reference::Problem;
 use crate::control::{Law, Memory, Mode, Ocbf, Partner, Situation};
-use crate::scenario::{ReferenceLaw, load};
+use crate::scenario::{ReferenceLaw, load_embedded};
 use serde_json::{Value, json};
 
-/// The vectors as JSON: plans, and whole decisions under the default scenario's parameters.
+/// The vectors as JSON: plans, and whole decisions under the parameters of the paper's setting.
 pub(super) fn text() -> String {
     let vectors = json!({
-        "about": "plans: corrected transversality condition; decisions: parameters of the default scenario, \
+        "about": "plans: corrected transversality condition; decisions: parameters of the scenario paper, \
                   vehicles in OCBF mode without a plan yet; SI units",
         "plans": plans(),
         "decisions": decisions(),
@@ -36,7 +36,7 @@ fn plans() -> Vec<Value> {
 }
 
 fn decisions() -> Vec<Value> {
-    let scenario = load(None, &[], None).expect("the embedded scenario is valid");
+    let scenario = load_embedded("paper", &[], None).expect("the embedded scenario is valid");
     let law = Ocbf::new(&scenario);
     let mut vectors = Vec::new();
     for (x_m, v_mps) in [(10.0, 16.0), (60.0, 18.0), (120.0, 15.0), (180.0, 19.0)] {

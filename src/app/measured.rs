@@ -5,16 +5,17 @@ use super::args::{ConductArgs, ScenarioArgs, ShareArgs, WaitArgs};
 use super::record::Recording;
 use super::run::own_name;
 use super::supervise::{self, Plan};
+use crate::bench::MEASURED;
 use crate::process::{Outcome, Placement, new_run_id};
 use comfy_table::{CellAlignment, Table, presets};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-/// The default scenario with the whole trace: ten times as many steps as `cz run` takes.
+/// The scenario that is measured, with the whole trace: ten times as many steps as `cz run` takes.
 pub(super) fn scenario_of(quick: bool) -> ScenarioArgs {
     let set = if quick { vec![] } else { vec!["end.vehicles=600".to_owned()] };
-    ScenarioArgs { scenario: None, seed: Some(1), set, side_by_side: None }
+    ScenarioArgs { scenario: Some(MEASURED.to_owned()), seed: Some(1), set, side_by_side: None }
 }
 
 pub(super) const WAIT: WaitArgs = WaitArgs {

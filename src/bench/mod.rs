@@ -27,6 +27,9 @@ use crate::process::ProcessError;
 use crate::transport::iox::SpaceError;
 use std::time::Duration;
 
+/// The embedded scenario that measurements run unless they say another: the paper's setting, whatever becomes of the default.
+pub const MEASURED: &str = "paper";
+
 /// Why a measurement could not be made.
 #[derive(Debug, thiserror::Error)]
 pub enum BenchError {

@@ -228,7 +228,7 @@ fn is_possible(scene: &str, side: &Side) -> bool {
 }
 
 /// The scene of three processes.
-pub const THREE: &str = "two-merges";
+pub const THREE: &str = super::MEASURED;
 /// The scene of nine.
 pub const NINE: &str = "corridor-8, four of each";
 

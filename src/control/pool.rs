@@ -410,7 +410,7 @@ mod tests {
 
     #[test]
     fn assignments_the_law_could_not_plan_with_are_refused() {
-        let scenario = Arc::new(load_embedded("two-merges", &[], None).unwrap());
+        let scenario = Arc::new(load_embedded("paper", &[], None).unwrap());
         let v_max_mps = scenario.vehicle.v_max_mps;
         let states = [VehicleState { v_mps: 15.0, entry_speed_mps: 15.0, ..VehicleState::default() }];
         let good = Assignment {

@@ -71,7 +71,7 @@ impl Check {
 
 /// Runs all cases.
 pub fn checks() -> Result<Vec<Check>, ReproduceError> {
-    let base = scenario::load_embedded("two-merges", &[], Some(1))?;
+    let base = scenario::load_embedded("paper", &[], Some(1))?;
     let mut checks = Vec::new();
     for beta in [2.0 / 3.0, 8.0 / 3.0] {
         for v0_mps in [10.0, 16.0, 20.0] {

@@ -65,7 +65,9 @@ fn pauses_and_catches_up(language: &str, command: &str, policy: &str, arguments:
     let file = folder.path().join("run.czlog");
     let record = file.to_str().unwrap();
     let conduct = ["--deadline", "0.02", "--on-miss", policy, "--shield", "on", "--record", record];
-    let (summary, ended) = driven(&site, command, &[&conduct[..], arguments].concat());
+    // What should fit together is worked out for the order of entry.
+    let arguments = [&["--set", "coordination.order=fifo"], arguments].concat();
+    let (summary, ended) = driven(&site, command, &[&conduct[..], &arguments].concat());
     let [answered, skipped, wrong] = counts(&ended);
     let steps = summary["steps"].as_u64().unwrap();
     let missed = summary["punctuality"]["missed_steps"].as_u64().unwrap();

@@ -77,7 +77,7 @@ fn the_commands_tell_what_is_in_a_file() {
     let course = json(&["show", &file, "--vehicle", &vehicle, "--json"]);
     assert!(course["course"].as_array().unwrap().iter().any(|row| row["step"] == 200), "{course}");
     let (_, out, _) = cz(&["show", &file, "--vehicle", &vehicle]);
-    assert!(out.contains("OCBF"), "{out}");
+    assert!(out.contains("scheduled"), "{out}");
     let (_, out, _) = cz(&["show", &file, "--scenario"]);
     assert!(out.contains("--set end.vehicles=12") && out.contains("[[zones]]"), "{out}");
 

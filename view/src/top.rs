@@ -480,10 +480,10 @@ mod tests {
     use control_zones::record::Step as Kept;
     use control_zones::scenario::{Override, load_embedded};
 
-    /// The board after so many steps of the default scenario.
+    /// The board after so many steps of the paper's setting.
     fn board(steps: u64) -> (Board, Kept) {
         let none: [Override; 0] = [];
-        let scenario = Arc::new(load_embedded("two-merges", &none, None).unwrap());
+        let scenario = Arc::new(load_embedded("paper", &none, None).unwrap());
         let mut run = InProcess::observed(&scenario, 1, 1);
         let mut board = Board::new("test".to_owned(), 1, scenario);
         let mut last = None;

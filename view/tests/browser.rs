@@ -83,9 +83,8 @@ fn clicking_and_scrubbing_tell_of_a_vehicle_what_the_recording_holds() {
 #[test]
 fn two_recordings_are_shown_at_the_same_step() {
     let Some(browser) = Browser::start((1440, 900)) else { return };
-    let first = record("two-merges", &["--set", "end.vehicles=20"]);
-    let second =
-        record("two-merges", &["--set", "end.vehicles=20", "--set", "zones.merge-1.flow.gain_mps=0.05"]);
+    let first = record("paper", &["--set", "end.vehicles=20"]);
+    let second = record("paper", &["--set", "end.vehicles=20", "--set", "zones.merge-1.flow.gain_mps=0.05"]);
     let page = Page::of(&[first.path(), second.path()]);
     browser.open(page.address());
     browser.until("window.view && view.state.maps?.length === 2 && view.state.maps.every(m => m.frame)");

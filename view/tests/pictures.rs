@@ -84,8 +84,9 @@ fn pictures() {
     let roundabout = record("roundabout", &[]);
     let page = Page::of(&[roundabout.path()]);
     take(&browser, &page, &shot("view-roundabout.png", 1500, "view.setColour('mode')", None));
-    let other = record_as("gain-1.5.czlog", "two-merges", &["--set", "zones.merge-1.flow.gain_mps=1.5"]);
-    let page = Page::of(&[merge.path(), other.path()]);
+    let other = record_as("gain-1.5.czlog", "paper", &["--set", "zones.merge-1.flow.gain_mps=1.5"]);
+    let paper = record("paper", &[]);
+    let page = Page::of(&[paper.path(), other.path()]);
     take(
         &browser,
         &page,

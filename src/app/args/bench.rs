@@ -1,6 +1,7 @@
 //! Arguments of `cz bench`.
 
 use super::ScenarioArgs;
+use crate::bench::MEASURED;
 use crate::scenario::{Scenario, ScenarioError};
 use clap::{Args, Subcommand};
 use std::path::PathBuf;
@@ -76,7 +77,7 @@ pub(in crate::app) struct PeerArgs {
     pub values: Vec<String>,
 }
 
-/// The scenario of a measurement's other process: always the default one, changed.
+/// The scenario of a measurement's other process: always the one that is measured, changed.
 #[derive(Debug, Args)]
 pub(in crate::app) struct PeerScenarioArgs {
     #[arg(long)]
@@ -88,6 +89,6 @@ pub(in crate::app) struct PeerScenarioArgs {
 impl PeerScenarioArgs {
     pub fn load(&self) -> Result<Scenario, ScenarioError> {
         let (seed, set) = (self.seed, self.set.clone());
-        ScenarioArgs { scenario: None, seed, set, side_by_side: None }.load()
+        ScenarioArgs { scenario: Some(MEASURED.to_owned()), seed, set, side_by_side: None }.load()
     }
 }

@@ -67,7 +67,7 @@ pub(in crate::app) struct BranchArgs {
     /// The first step of the other future.
     #[arg(long, value_name = "STEP")]
     pub at: u64,
-    /// Change a scenario key from then on, e.g. `--set zones.merge-1.flow.gain_mps=0.3`; may be repeated.
+    /// Change a scenario key from then on, e.g. `--set coordination.price_of_time=0.5`; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE", required = true)]
     pub set: Vec<String>,
     /// Print JSON.

@@ -15,7 +15,7 @@ pub(in crate::app) struct ScenarioArgs {
     /// Seed of all random streams, in place of the scenario's.
     #[arg(long, value_name = "N")]
     pub seed: Option<u64>,
-    /// Change a scenario key, e.g. `--set zones.merge-1.flow.gain_mps=0.3`; may be repeated.
+    /// Change a scenario key, e.g. `--set coordination.price_of_time=0.5`; may be repeated.
     #[arg(long = "set", value_name = "KEY=VALUE")]
     pub set: Vec<String>,
     /// A generated network that holds about this many vehicles at once.
