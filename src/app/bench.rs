@@ -29,6 +29,10 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
             let report = latency(args.quick)?;
             deliver(args.json.as_deref(), &report, &latency_table(&report))
         }
+        BenchKind::Law(args) => {
+            let report = super::bench_law::measure(args)?;
+            deliver(args.json.as_deref(), &report, &super::bench_law::table(&report))
+        }
         BenchKind::Solver(args) => {
             let scenario = Arc::new(scenario_of(args.quick).load()?);
             let report = bench::solver(&scenario)?;
@@ -58,7 +62,7 @@ fn deliver(json: Option<&Path>, report: &impl serde::Serialize, table: &str) -> 
     print(table)
 }
 
-fn run_processes(
+pub(super) fn run_processes(
     scenario: &ScenarioArgs,
     controllers: u32,
     record: Option<&Path>,

@@ -2,6 +2,7 @@
 
 mod args;
 mod bench;
+mod bench_law;
 mod bench_wait;
 mod clean;
 mod controllers;

@@ -16,6 +16,8 @@ pub(in crate::app) struct BenchArgs {
 pub(in crate::app) enum BenchKind {
     /// One step, next to the machine's floor and to what one would write instead.
     Latency(MeasureArgs),
+    /// A step under the law `viable` with schedules, next to the same step under the paper's law.
+    Law(MeasureArgs),
     /// The closed-form QP next to Clarabel, and the whole controller.
     Solver(MeasureArgs),
     /// Step time from a hundred to a hundred thousand vehicles.
