@@ -7,8 +7,14 @@ of record. Every record has the static method `type_name()` that the iceoryx2 wh
 as the Rust processes do. `records(sample, VehicleState)` is the slice of a sample.
 """
 
+from __future__ import annotations
+
 import ctypes
 import sys
+import typing
+
+if typing.TYPE_CHECKING:
+    Record = typing.TypeVar("Record", bound=ctypes._CData)
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
 SCHEMA_HASH = 0xf214663ee06bf4cd
@@ -215,6 +221,18 @@ class FrameHeader(ctypes.Structure):
         ("flags", ctypes.c_uint32),
     ]
 
+    run_id: int
+    schema_hash: int
+    step: int
+    time_ns: int
+    coordinators_acting: int
+    coordinators_summarised: int
+    sender_role: int
+    sender_index: int
+    generation: int
+    record_count: int
+    flags: int
+
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
@@ -275,6 +293,24 @@ class VehicleState(ctypes.Structure):
         ("flags", ctypes.c_uint16),
     ]
 
+    x_m: float
+    v_mps: float
+    u_mps2: float
+    entry_time_s: float
+    entry_speed_mps: float
+    planned_exit_time_s: float
+    planned_exit_speed_mps: float
+    length_m: float
+    vehicle: int
+    zone: int
+    path: int
+    next_zone: int
+    next_path: int
+    then_path: int
+    link: int
+    kind: int
+    flags: int
+
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
@@ -332,6 +368,21 @@ class Assignment(ctypes.Structure):
         ("flags", ctypes.c_uint16),
     ]
 
+    own_conflict_m: float
+    partner_conflict_m: float
+    gap_m: float
+    until_m: float
+    terminal_speed_mps: float
+    scheduled_at_m: float
+    scheduled_time_s: float
+    vehicle: int
+    partner: int
+    zone: int
+    point: int
+    rank: int
+    kind: int
+    flags: int
+
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
@@ -385,6 +436,22 @@ class ZoneSummary(ctypes.Structure):
         ("kind", ctypes.c_uint16),
         ("flags", ctypes.c_uint16),
     ]
+
+    segment_m: float
+    segment_mean_speed_mps: float
+    x_m: float
+    v_mps: float
+    planned_exit_time_s: float
+    planned_exit_speed_mps: float
+    from_zone: int
+    to_zone: int
+    vehicles: int
+    segment_vehicles: int
+    vehicle: int
+    path: int
+    next_path: int
+    kind: int
+    flags: int
 
     @staticmethod
     def type_name() -> str:
@@ -443,6 +510,23 @@ class VehicleCommand(ctypes.Structure):
         ("verdict", ctypes.c_uint16),
     ]
 
+    u_mps2: float
+    planned_exit_time_s: float
+    planned_exit_speed_mps: float
+    memory_0: float
+    memory_1: float
+    memory_2: float
+    memory_3: float
+    memory_4: float
+    memory_5: float
+    memory_6: float
+    memory_7: float
+    vehicle: int
+    zone: int
+    binding_rows: int
+    mode: int
+    verdict: int
+
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
@@ -470,6 +554,11 @@ class Member(ctypes.Structure):
         ("role", ctypes.c_uint16),
         ("index", ctypes.c_uint16),
     ]
+
+    process_id: int
+    generation: int
+    role: int
+    index: int
 
     @staticmethod
     def type_name() -> str:
@@ -508,6 +597,16 @@ class AttachRequest(ctypes.Structure):
         ("phase", ctypes.c_uint32),
         ("index", ctypes.c_uint32),
     ]
+
+    instance: int
+    schema_hash: int
+    scenario_hash: int
+    controller: int
+    process_id: int
+    role: int
+    wanted_index: int
+    phase: int
+    index: int
 
     @staticmethod
     def type_name() -> str:
@@ -553,6 +652,20 @@ class AttachReply(ctypes.Structure):
         ("waiting", ctypes.c_uint32),
         ("reserved", ctypes.c_uint32),
     ]
+
+    instance: int
+    run_id: int
+    schema_hash: int
+    scenario_hash: int
+    first_step: int
+    status: int
+    world_process_id: int
+    generation: int
+    index: int
+    coordinators: int
+    controllers: int
+    waiting: int
+    reserved: int
 
     @staticmethod
     def type_name() -> str:
@@ -620,6 +733,31 @@ class RunSpec(ctypes.Structure):
         ("shield", ctypes.c_uint32),
     ]
 
+    dt_s: float
+    max_time_s: float
+    beta: float
+    u_min_mps2: float
+    u_max_mps2: float
+    v_min_mps: float
+    v_max_mps: float
+    reaction_time_s: float
+    standstill_gap_m: float
+    vehicle_length_m: float
+    k_rear_end_per_s: float
+    k_merge_per_s: float
+    k_speed_per_s: float
+    clf_rate_per_s: float
+    slack_weight: float
+    fe_fraction: float
+    dt_ns: int
+    seed: int
+    zones: int
+    paths: int
+    kinds: int
+    reserved: int
+    law_flags: int
+    shield: int
+
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
@@ -652,6 +790,15 @@ class PathSpec(ctypes.Structure):
         ("flags", ctypes.c_uint32),
     ]
 
+    length_m: float
+    link_m: float
+    zone: int
+    path: int
+    exit: int
+    next_zone: int
+    controller: int
+    flags: int
+
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
@@ -681,6 +828,14 @@ class KindSpec(ctypes.Structure):
         ("standstill_gap_m", ctypes.c_double),
     ]
 
+    u_min_mps2: float
+    u_max_mps2: float
+    v_min_mps: float
+    v_max_mps: float
+    length_m: float
+    reaction_time_s: float
+    standstill_gap_m: float
+
     @staticmethod
     def type_name() -> str:
         """Name under which the transport registers the type."""
@@ -688,7 +843,7 @@ class KindSpec(ctypes.Structure):
 
 
 #: All record types, in the order the schema hash covers them.
-RECORDS = (
+RECORDS: tuple[type[ctypes.Structure], ...] = (
     FrameHeader,
     VehicleState,
     Assignment,
@@ -718,7 +873,7 @@ TYPE_NAMES = {
 }
 
 # Size, alignment and field offsets of each record, as Rust has them.
-_LAYOUTS = {
+_LAYOUTS: dict[type[ctypes.Structure], tuple[int, int, dict[str, int]]] = {
     FrameHeader: (
         64,
         8,
@@ -931,7 +1086,7 @@ def _check_layouts() -> None:
     if sys.byteorder != "little":
         raise ImportError("frames are little-endian and are used in place")
     for record, (size, align, offsets) in _LAYOUTS.items():
-        found = {name: getattr(record, name).offset for name, _ in record._fields_}
+        found = {field[0]: getattr(record, field[0]).offset for field in record._fields_}
         if (ctypes.sizeof(record), ctypes.alignment(record), found) != (size, align, offsets):
             raise ImportError(f"{record.__name__} is not laid out as its frames are")
 
@@ -939,13 +1094,14 @@ def _check_layouts() -> None:
 _check_layouts()
 
 
-def records(sample, record):
+def records(sample: typing.Any, record: type[Record]) -> ctypes.Array[Record]:
     """The records of an iceoryx2 sample, in place, as a ctypes array of `record`.
 
     Use it instead of `sample.payload()`: the slice that iceoryx2 0.10.0 returns takes the number of
     bytes for the number of elements, so that a loop over it leaves the frame. The array and its
     elements keep the sample alive; drop them to give the sample back.
     """
-    array = (record * sample.header.number_of_elements).from_address(sample.payload_ptr)
+    array: typing.Any = (record * sample.header.number_of_elements).from_address(sample.payload_ptr)
     array.sample = sample
-    return array
+    found: ctypes.Array[Record] = array
+    return found

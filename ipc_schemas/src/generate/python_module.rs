@@ -13,7 +13,7 @@ def _check_layouts() -> None:
     if sys.byteorder != "little":
         raise ImportError("frames are little-endian and are used in place")
     for record, (size, align, offsets) in _LAYOUTS.items():
-        found = {name: getattr(record, name).offset for name, _ in record._fields_}
+        found = {field[0]: getattr(record, field[0]).offset for field in record._fields_}
         if (ctypes.sizeof(record), ctypes.alignment(record), found) != (size, align, offsets):
             raise ImportError(f"{record.__name__} is not laid out as its frames are")
 
@@ -25,16 +25,17 @@ _check_layouts()
 /// there are bytes (eclipse-iceoryx/iceoryx2#1533): its `len()` and its bounds check cannot be trusted.
 const RECORDS_OF: &str = r#"
 
-def records(sample, record):
+def records(sample: typing.Any, record: type[Record]) -> ctypes.Array[Record]:
     """The records of an iceoryx2 sample, in place, as a ctypes array of `record`.
 
     Use it instead of `sample.payload()`: the slice that iceoryx2 0.10.0 returns takes the number of
     bytes for the number of elements, so that a loop over it leaves the frame. The array and its
     elements keep the sample alive; drop them to give the sample back.
     """
-    array = (record * sample.header.number_of_elements).from_address(sample.payload_ptr)
+    array: typing.Any = (record * sample.header.number_of_elements).from_address(sample.payload_ptr)
     array.sample = sample
-    return array
+    found: ctypes.Array[Record] = array
+    return found
 "#;
 
 /// The whole module.
@@ -49,8 +50,14 @@ pub(super) fn render() -> String {
          as the Rust processes do. `records(sample, VehicleState)` is the slice of a sample.\n\
          \"\"\"\n\
          \n\
+         from __future__ import annotations\n\
+         \n\
          import ctypes\n\
          import sys\n\
+         import typing\n\
+         \n\
+         if typing.TYPE_CHECKING:\n    \
+             Record = typing.TypeVar(\"Record\", bound=ctypes._CData)\n\
          \n\
          #: Hash of all record layouts: what the fields named `schema_hash` carry.\n\
          SCHEMA_HASH = 0x{:016x}\n",
@@ -75,7 +82,10 @@ pub(super) fn render() -> String {
         record(&mut out, &layout);
     }
 
-    out.push_str("\n\n#: All record types, in the order the schema hash covers them.\nRECORDS = (\n");
+    out.push_str(
+        "\n\n#: All record types, in the order the schema hash covers them.\n\
+         RECORDS: tuple[type[ctypes.Structure], ...] = (\n",
+    );
     for layout in LAYOUTS {
         let _ = writeln!(out, "    {},", layout.name);
     }
@@ -84,7 +94,7 @@ pub(super) fn render() -> String {
         let _ = writeln!(out, "    \"{}\": \"{}\",", layout.name, layout.type_name);
     }
     out.push_str(
-        "}\n\n# Size, alignment and field offsets of each record, as Rust has them.\n_LAYOUTS = {\n",
+        "}\n\n# Size, alignment and field offsets of each record, as Rust has them.\n_LAYOUTS: dict[type[ctypes.Structure], tuple[int, int, dict[str, int]]] = {\n",
     );
     for layout in LAYOUTS {
         let _ = writeln!(
@@ -123,9 +133,14 @@ fn record(out: &mut String, layout: &Layout) {
         };
         let _ = writeln!(out, "        (\"{}\", ctypes.{scalar}),", field.name);
     }
+    out.push_str("    ]\n\n");
+    for field in layout.fields {
+        let kind = if field.scalar == Scalar::F64 { "float" } else { "int" };
+        let _ = writeln!(out, "    {}: {kind}", field.name);
+    }
     let _ = writeln!(
         out,
-        "    ]\n\n    @staticmethod\n    def type_name() -> str:\n        \
+        "\n    @staticmethod\n    def type_name() -> str:\n        \
          \"\"\"Name under which the transport registers the type.\"\"\"\n        return \"{}\"",
         layout.type_name
     );

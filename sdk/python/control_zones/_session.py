@@ -1,5 +1,7 @@
 """Joining a run and answering its steps."""
 
+from __future__ import annotations
+
 import ctypes
 import fcntl
 import os
@@ -9,11 +11,19 @@ import shutil
 import stat
 import sys
 import time
+import typing
 
 import iceoryx2
 
 from . import _schemas as s
 from ._view import Partners, ZoneView, frozen, structured
+
+if typing.TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
+    #: One acceleration per vehicle of the view, m/s^2.
+    Controller = Callable[[ZoneView], Iterable[float]]
+    Record = typing.TypeVar("Record", bound=ctypes.Structure)
 
 #: Seconds of polling before sleeping between polls.
 _BUSY_S = 0.002
@@ -26,8 +36,6 @@ _REPEAT_S = 0.1
 _AT_ONCE = 16
 #: Accounts of refused frames are kept for this many senders; the rest share one.
 _MAX_ACCOUNTS = 16
-#: Process, generation and sending end where there is no coordinator.
-_NOBODY = (None, None, None)
 #: In the place of a fault: the frame is of somebody who had the place before.
 _LATE = "late"
 
@@ -47,23 +55,23 @@ class Run:
         lengths: `lengths[zone][path]`, m; own: set of (zone, path) this controller drives.
     """
 
-    def __init__(self, data, index):
+    def __init__(self, data: bytes, index: int) -> None:
         size = ctypes.sizeof(s.RunSpec)
         if len(data) < size:
             raise Error(f"the world's reply has {len(data)} bytes, which is not a run specification")
         self.spec = s.RunSpec.from_buffer_copy(data)
         self.index = index
-        self.paths = []
+        self.paths: list[s.PathSpec] = []
         for _ in range(self.spec.paths):
             self.paths.append(s.PathSpec.from_buffer_copy(data, size))
             size += ctypes.sizeof(s.PathSpec)
-        self.kinds = []
+        self.kinds: list[s.KindSpec] = []
         for _ in range(self.spec.kinds):
             self.kinds.append(s.KindSpec.from_buffer_copy(data, size))
             size += ctypes.sizeof(s.KindSpec)
         self.names = bytes(data[size:]).decode().splitlines()
-        self.lengths = {}
-        self.zone_names = {}
+        self.lengths: dict[int, dict[int, float]] = {}
+        self.zone_names: dict[int, str] = {}
         for a, name in zip(self.paths, self.names):
             self.lengths.setdefault(a.zone, {})[a.path] = a.length_m
             self.zone_names[a.zone] = name.split(".")[0]
@@ -71,7 +79,7 @@ class Run:
         self.own_zones = sorted({zone for zone, _ in self.own})
 
 
-def name_hash(name):
+def name_hash(name: str) -> int:
     """FNV-1a, 64 bits: how a controller's name travels."""
     h = 0xCBF29CE484222325
     for byte in name.encode():
@@ -79,7 +87,7 @@ def name_hash(name):
     return max(h, 1)
 
 
-def _place(run):
+def _place(run: str) -> tuple[str, str, int] | None:
     """Directory of a run, prefix of its files, and its marker opened; None while it has not been begun
     (docs/plugin-contract.md)."""
     uid = os.getuid()
@@ -107,11 +115,11 @@ def _place(run):
     return directory, f"cz_{uid}_{run}_{instance}_", marker
 
 
-def _tmp():
+def _tmp() -> str:
     return os.environ.get("TMPDIR") or "/tmp"
 
 
-def _alive(pid):
+def _alive(pid: int) -> bool:
     try:
         with open(f"/proc/{pid}/stat") as line:
             return line.read().rsplit(")", 1)[1].split()[0] not in "ZX"
@@ -122,7 +130,9 @@ def _alive(pid):
 class Session:
     """One attachment to a run. Once there is one, the world counts on an answer to every step."""
 
-    def __init__(self, run=None, controller=None, attach_timeout=30.0):
+    def __init__(
+        self, run: str | None = None, controller: str | None = None, attach_timeout: float = 30.0
+    ) -> None:
         run = run or os.environ.get("CZ_RUN")
         controller = controller or os.environ.get("CZ_CONTROLLER")
         if not run or not controller:
@@ -169,7 +179,7 @@ class Session:
             wanted_index=s.ANY_INDEX,
             phase=s.ATTACH_JOIN,
         )
-        self._joined = None
+        self._joined: bytes | None = None
         reply, data = self._exchange(request, deadline, late)
         if reply.status != s.ATTACH_ACCEPTED:
             raise Error(f"the world refused controller {controller}: {data.decode()}")
@@ -193,28 +203,30 @@ class Session:
         request.phase = s.ATTACH_READY
         request.index = reply.index
         self._request = request
-        self._assignments = {zone: [] for zone in self.run.own_zones}
-        self._partners = {}
+        self._assignments: dict[int, list[s.Assignment]] = {zone: [] for zone in self.run.own_zones}
+        self._partners: dict[int, Partners] = {}
         # The first step whose coordination is not in force yet.
         self._next_step = 0
-        self._ask_again_at = None
-        self._state = None
+        self._ask_again_at: float | None = None
+        self._state: _State | None = None
         self._complete = False
         # Sending ends that have proved to be the world's, by role and service.
-        self._world_ports = set()
+        self._world_ports: set[int] = set()
         # Process, generation and proved sending end of each coordinator, as the world says.
-        self._coordinators = {}
-        self._refused = {}
+        self._coordinators: dict[int, tuple[int, int, int | None]] = {}
+        self._refused: dict[tuple[int, int, int], tuple[str, int, str]] = {}
         self._restore(*self._exchange(request, deadline, late))
 
-    def _service(self, name, record, header):
+    def _service(self, name: str, record: typing.Any, header: type[ctypes.Structure] | None) -> typing.Any:
         builder = self._node.service_builder(iceoryx2.ServiceName.new(name)).publish_subscribe(record)
         return (builder if header is None else builder.user_header(header)).open()
 
-    def _service_of(self, name, record):
+    def _service_of(self, name: str, record: type[ctypes.Structure]) -> typing.Any:
         return self._service(name, iceoryx2.Slice[record], s.FrameHeader)
 
-    def _exchange(self, request, deadline, late):
+    def _exchange(
+        self, request: s.AttachRequest, deadline: float, late: Error
+    ) -> tuple[s.AttachReply, bytes]:
         repeat_at = 0.0
         while True:
             if time.monotonic() >= repeat_at:
@@ -225,7 +237,7 @@ class Session:
                 return found
             _pause(deadline, late)
 
-    def _reply(self, instance):
+    def _reply(self, instance: int) -> tuple[s.AttachReply, bytes] | None:
         """The next reply to this controller, and the bytes behind it, if one has come."""
         while (sample := self._replies.receive()) is not None:
             reply = s.AttachReply.from_buffer_copy(sample.user_header().contents)
@@ -235,7 +247,7 @@ class Session:
                 return reply, data
         return None
 
-    def _restore(self, reply, data):
+    def _restore(self, reply: s.AttachReply, data: bytes) -> None:
         """Takes the assignments in force from a reply."""
         if reply.status != s.ATTACH_ACCEPTED:
             raise Error(f"the world refused this controller: {data.decode(errors='replace')}")
@@ -247,9 +259,9 @@ class Session:
         self._partners = {}
         self._coordinate((s.Assignment * count).from_buffer_copy(data))
 
-    def _coordinate(self, records):
+    def _coordinate(self, records: Iterable[s.Assignment]) -> None:
         """Replaces the coordination of the zones that these are for."""
-        changed = {}
+        changed: dict[int, list[s.Assignment]] = {}
         for record in records:
             if record.zone in self._assignments:
                 changed.setdefault(record.zone, []).append(record)
@@ -257,7 +269,7 @@ class Session:
             self._assignments[zone] = assignments
             self._partners.pop(zone, None)
 
-    def wait(self, timeout=None):
+    def wait(self, timeout: float | None = None) -> bool:
         """Waits for a step: True when there is one to be answered, False at the end of the run.
 
         Raises `TimeoutError` when nothing came for `timeout` seconds.
@@ -287,7 +299,7 @@ class Session:
             if now - start >= _BUSY_S:
                 time.sleep(_NAP_S)
 
-    def _poll(self):
+    def _poll(self) -> bool | None:
         """Does what can be done now: True for a step to be answered, False at the end, None to go on waiting."""
         if self._ask_again_at is not None:
             found = self._reply(self._request.instance)
@@ -313,7 +325,7 @@ class Session:
         self._complete = True
         return True
 
-    def _take_states(self):
+    def _take_states(self) -> bool:
         """Takes the newest state; an older one would be answered too late. Whether the run is over."""
         for _ in range(_AT_ONCE):
             sample = self._states.receive()
@@ -335,7 +347,7 @@ class Session:
             self._state = None
         return False
 
-    def _take_coordination(self, state):
+    def _take_coordination(self, state: _State) -> None:
         """Takes coordination of the step at hand, as far as it has come."""
         for _ in range(_AT_ONCE):
             if not state.missing:
@@ -358,7 +370,7 @@ class Session:
                 self._coordinate(records)
                 state.missing &= ~(1 << header.sender_index)
 
-    def _catch_up(self):
+    def _catch_up(self) -> None:
         """Asks for the coordination in force, and again while no answer comes."""
         now = time.monotonic()
         if self._ask_again_at is not None:
@@ -376,7 +388,7 @@ class Session:
         self._requests.send_copy(request)
         self._ask_again_at = now + _REPEAT_S
 
-    def _not_the_world(self, header, sample):
+    def _not_the_world(self, header: s.FrameHeader, sample: typing.Any) -> str | None:
         """Why a frame is not the world's, if it is not."""
         fault = self._fault(header, sample, s.ROLE_WORLD)
         if fault is None and (header.sender_index, header.generation) != (0, 0):
@@ -387,17 +399,19 @@ class Session:
             self._world_ports.add(port)
         return fault
 
-    def _no_coordinator(self, header, sample):
+    def _no_coordinator(self, header: s.FrameHeader, sample: typing.Any) -> str | None:
         """Why a frame is not one of a coordinator of the run, if it is not."""
         fault = self._fault(header, sample, s.ROLE_COORDINATOR)
         if fault is not None:
             return fault
         port = sample.header.publisher_id.value
-        if self._coordinators.get(header.sender_index, _NOBODY)[2] != port:
+        member = self._coordinators.get(header.sender_index)
+        if member is None or member[2] != port:
             self._listen()
-        process, generation, known = self._coordinators.get(header.sender_index, _NOBODY)
-        if process is None:
+            member = self._coordinators.get(header.sender_index)
+        if member is None:
             return f"the run has no coordinator {header.sender_index}"
+        process, generation, known = member
         if header.generation < generation:
             # What one that has died left; its successor sends the same again.
             return _LATE
@@ -409,7 +423,7 @@ class Session:
             self._coordinators[header.sender_index] = process, generation, port
         return None
 
-    def _listen(self):
+    def _listen(self) -> None:
         """Takes what the world has said of who has which place."""
         while (sample := self._members.receive()) is not None:
             header = s.FrameHeader.from_buffer_copy(sample.user_header().contents)
@@ -419,11 +433,11 @@ class Session:
                 self._refuse(header, sample, fault)
                 continue
             for member in records:
-                known = self._coordinators.get(member.index, _NOBODY)
+                known = self._coordinators.get(member.index, (None, None))
                 if member.role == s.ROLE_COORDINATOR and known[:2] != (member.process_id, member.generation):
                     self._coordinators[member.index] = member.process_id, member.generation, None
 
-    def _fault(self, header, sample, role):
+    def _fault(self, header: s.FrameHeader, sample: typing.Any, role: int) -> str | None:
         """What is wrong with the header of a frame, if anything is."""
         for field, expected in (
             ("schema_hash", s.SCHEMA_HASH),
@@ -436,28 +450,28 @@ class Session:
                 return f"it has {field} = {found}, expected {expected}"
         return None
 
-    def _refuse(self, header, sample, fault):
+    def _refuse(self, header: s.FrameHeader, sample: typing.Any, fault: str) -> None:
         key = header.sender_role, header.sender_index, sample.header.publisher_id.value
         if key not in self._refused and len(self._refused) >= _MAX_ACCOUNTS:
             key = next(reversed(self._refused))
         sender, frames, _ = self._refused.get(key) or (_claim(header, _process_of(sample)), 0, None)
         self._refused[key] = sender, frames + 1, fault
 
-    def refused(self):
+    def refused(self) -> list[str]:
         """What was refused, in words: one line per sender."""
         return [f"refused {n} frames of {sender}; the last: {last}" for sender, n, last in self._refused.values()]
 
     @property
-    def step(self):
+    def step(self) -> int | None:
         """Number of the step to be answered; None while there is none."""
-        return self._state.header.step if self._complete else None
+        return self._state.header.step if self._state is not None and self._complete else None
 
-    def answer(self, controller):
+    def answer(self, controller: Controller) -> None:
         """Answers the step: calls `controller(view)` for each of its zones and sends what it returns.
 
         An answer that comes too late is dropped: the next step is another chance.
         """
-        if not self._complete:
+        if self._state is None or not self._complete:
             raise Error("there is no step to answer; wait for one first")
         header, states, frame = self._state.header, self._state.records, self._state.frame
         zones = self._own(states)
@@ -472,6 +486,7 @@ class Session:
                 local = [i - start for i in own]
                 self._partners[zone] = Partners(states[start:end], local, self._assignments[zone])
             contiguous = own[-1] - own[0] + 1 == len(own)
+            places: slice | list[int]
             places = slice(own[0] - start, own[-1] + 1 - start) if contiguous else [i - start for i in own]
             part = records[at : at + len(own)]
             for k, i in enumerate(own):
@@ -487,7 +502,7 @@ class Session:
             at += len(own)
         self._send(header, commands)
 
-    def _send(self, header, commands):
+    def _send(self, header: s.FrameHeader, commands: ctypes.Array[s.VehicleCommand]) -> None:
         # Lent only now, so that a controller that fails leaves nothing on loan.
         loan = self._commands.loan_slice_uninit(len(commands))
         out = loan.user_header().contents
@@ -510,7 +525,7 @@ class Session:
         if reached == 0 and not _alive(self.reply.world_process_id):
             raise Error(f"the world (process {self.reply.world_process_id}) has ended without an end of the run")
 
-    def close(self):
+    def close(self) -> None:
         """Leaves the run. Whoever leaves last removes what iceoryx2 leaves behind."""
         if self._node is None:
             return
@@ -528,7 +543,7 @@ class Session:
         finally:
             os.close(self._marker)
 
-    def _remove(self):
+    def _remove(self) -> None:
         for name in os.listdir("/dev/shm"):
             if name.startswith(self._prefix):
                 _forget(os.remove, os.path.join("/dev/shm", name))
@@ -541,57 +556,59 @@ class Session:
         # Fails, as it should, while another run has its directory there.
         _forget(os.rmdir, os.path.dirname(self._directory))
 
-    def __enter__(self):
+    def __enter__(self) -> Session:
         return self
 
-    def __exit__(self, *_):
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _own(self, states):
+    def _own(self, states: Iterable[s.VehicleState]) -> list[tuple[int, tuple[int, int], list[int]]]:
         """Per own zone: its slice of the frame, and the places of the vehicles to be commanded."""
-        zones = {zone: [None, 0, []] for zone in self.run.own_zones}
+        slices: dict[int, tuple[int, int]] = {zone: (0, 0) for zone in self.run.own_zones}
+        places: dict[int, list[int]] = {zone: [] for zone in self.run.own_zones}
         drives = self.run.own
         for i, state in enumerate(states):
-            entry = zones.get(state.zone)
-            if entry is None:
+            known = slices.get(state.zone)
+            if known is None:
                 continue
-            if entry[0] is None:
-                entry[0] = i
-            entry[1] = i + 1
+            start, end = known
+            slices[state.zone] = (start if end else i, i + 1)
             if not state.flags & s.STATE_LEFT and (state.zone, state.path) in drives:
-                entry[2].append(i)
-        return [(zone, (start or 0, end), own) for zone, (start, end, own) in zones.items()]
+                places[state.zone].append(i)
+        return [(zone, found, places[zone]) for zone, found in slices.items()]
 
 
 class _State:
     """A state to be answered: copies, so that nothing of it lies where others write."""
 
-    def __init__(self, header, sample):
+    def __init__(self, header: s.FrameHeader, sample: typing.Any) -> None:
         self.header = header
         self.records = _copied(sample, s.VehicleState)
         self.frame = structured(self.records)
         # Coordinators whose frame of this step is still to come.
-        self.missing = header.coordinators_acting
+        self.missing: int = header.coordinators_acting
 
 
-def _copied(sample, record):
+def _copied(sample: typing.Any, record: type[Record]) -> ctypes.Array[Record]:
     size = sample.header.number_of_elements * ctypes.sizeof(record)
     data = ctypes.string_at(sample.payload_ptr, size)
-    return (record * sample.header.number_of_elements).from_buffer_copy(data)
+    array: type[ctypes.Array[Record]] = record * sample.header.number_of_elements
+    return array.from_buffer_copy(data)
 
 
-def _process_of(sample):
+def _process_of(sample: typing.Any) -> int:
     """The process of a frame's sender, as the transport names it."""
-    return sample.header.node_id.pid(iceoryx2.ServiceType.Ipc)
+    process: int = sample.header.node_id.pid(iceoryx2.ServiceType.Ipc)
+    return process
 
 
-def _claim(header, process):
+def _claim(header: s.FrameHeader, process: int) -> str:
     role = {s.ROLE_WORLD: "world", s.ROLE_COORDINATOR: "coordinator", s.ROLE_CONTROLLER: "controller"}
     name = role.get(header.sender_role, f"a sender of unknown role {header.sender_role},")
     return f"{name} {header.sender_index} (process {process})"
 
 
-def _accelerations(controller, view, count):
+def _accelerations(controller: Controller, view: ZoneView, count: int) -> list[float]:
     """What the controller decides for a zone, as numbers; if it cannot be, what to do about it."""
     where = f"step {view.step}, zone {view.name}"
     try:
@@ -614,20 +631,22 @@ def _accelerations(controller, view, count):
     return numbers
 
 
-def _forget(remove, path):
+def _forget(remove: Callable[[str], None], path: str) -> None:
     try:
         remove(path)
     except OSError:
         pass
 
 
-def _pause(deadline, late):
+def _pause(deadline: float, late: Error) -> None:
     if time.monotonic() >= deadline:
         raise late
     time.sleep(0.002)
 
 
-def run(controller, run=None, name=None, attach_timeout=30.0):
+def run(
+    controller: Controller, run: str | None = None, name: str | None = None, attach_timeout: float = 30.0
+) -> None:
     """Joins a run and answers every step to its end.
 
     `controller` is a function from a `ZoneView` to one acceleration per vehicle (m/s^2). If it has a method

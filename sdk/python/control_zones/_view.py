@@ -1,5 +1,8 @@
 """What a controller sees of one zone."""
 
+from __future__ import annotations
+
+import ctypes
 import typing
 
 from . import _schemas as s
@@ -7,7 +10,17 @@ from . import _schemas as s
 try:
     import numpy
 except ImportError:  # lists take the place of arrays
-    numpy = None
+    numpy = None  # type: ignore[assignment]
+
+if typing.TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from ._session import Run
+
+    Floats = NDArray[numpy.float64]
+    Ids = NDArray[numpy.uint32]
 
 NAN = float("nan")
 #: Records in a zone's slice that are not members.
@@ -44,7 +57,26 @@ class ZoneView:
             the function returns, other fields, such as the planned exit, may be set here.
     """
 
-    def __init__(self, run, zone, name, header, states, own, partners, commands):
+    run: Run
+    zone: int
+    name: str
+    step: int
+    time: float
+    dt: float
+    states: typing.Any
+    commands: typing.Any
+
+    def __init__(
+        self,
+        run: Run,
+        zone: int,
+        name: str,
+        header: s.FrameHeader,
+        states: typing.Any,
+        own: slice | list[int],
+        partners: Partners,
+        commands: typing.Any,
+    ) -> None:
         self.run = run
         self.zone = zone
         self.name = name
@@ -55,18 +87,19 @@ class ZoneView:
         self.commands = commands
         self._own = own
         self._partners = partners
-        self._cache = {}
+        self._cache: dict[object, Floats] = {}
+        self._partners_now: list[list[Partner]] | None = None
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.commands)
 
-    def _once(self, key, make):
+    def _once(self, key: object, make: Callable[[], Floats]) -> Floats:
         if key not in self._cache:
             self._cache[key] = frozen(make())
         return self._cache[key]
 
-    def _field(self, name):
-        def own():
+    def _field(self, name: str) -> Floats:
+        def own() -> typing.Any:
             if numpy is not None:
                 # A copy, so that whoever keeps it does not keep all records.
                 return numpy.array(self.states[name][self._own])
@@ -76,51 +109,94 @@ class ZoneView:
 
         return self._once(name, own)
 
-    vehicle = property(lambda self: self._field("vehicle"))
-    path = property(lambda self: self._field("path"))
-    x = property(lambda self: self._field("x_m"))
-    v = property(lambda self: self._field("v_mps"))
-    u = property(lambda self: self._field("u_mps2"))
-    entry_time = property(lambda self: self._field("entry_time_s"))
-    entry_speed = property(lambda self: self._field("entry_speed_mps"))
+    def _ids(self, name: str) -> Ids:
+        return typing.cast("Ids", self._field(name))
 
     @property
-    def length(self):
+    def vehicle(self) -> Ids:
+        return self._ids("vehicle")
+
+    @property
+    def path(self) -> Ids:
+        return self._ids("path")
+
+    @property
+    def x(self) -> Floats:
+        return self._field("x_m")
+
+    @property
+    def v(self) -> Floats:
+        return self._field("v_mps")
+
+    @property
+    def u(self) -> Floats:
+        return self._field("u_mps2")
+
+    @property
+    def entry_time(self) -> Floats:
+        return self._field("entry_time_s")
+
+    @property
+    def entry_speed(self) -> Floats:
+        return self._field("entry_speed_mps")
+
+    @property
+    def length(self) -> Floats:
         lengths = self.run.lengths[self.zone]
         return self._once("length", lambda: _array([lengths[path] for path in self.path]))
 
     @property
-    def terminal(self):
+    def terminal(self) -> Floats:
         return self._once("terminal", lambda: _array(self._partners.terminal))
 
     @property
-    def scheduled_at(self):
+    def scheduled_at(self) -> Floats:
         return self._once("scheduled_at", lambda: _array(self._partners.scheduled_at))
 
     @property
-    def scheduled_time(self):
+    def scheduled_time(self) -> Floats:
         return self._once("scheduled_time", lambda: _array(self._partners.scheduled_time))
 
-    ahead_x = property(lambda self: self._nearest("ahead", "x"))
-    ahead_v = property(lambda self: self._nearest("ahead", "v"))
-    ahead_u = property(lambda self: self._nearest("ahead", "u"))
-    merge_x = property(lambda self: self._nearest("merge", "x"))
-    merge_v = property(lambda self: self._nearest("merge", "v"))
-    merge_u = property(lambda self: self._nearest("merge", "u"))
-    merge_at = property(lambda self: self._nearest("merge", "at"))
+    @property
+    def ahead_x(self) -> Floats:
+        return self._nearest("ahead", "x")
 
     @property
-    def partners(self):
-        if "partners" not in self._cache:
-            self._cache["partners"] = self._partners.now(self.states, self.x)
-        return self._cache["partners"]
+    def ahead_v(self) -> Floats:
+        return self._nearest("ahead", "v")
 
-    def _nearest(self, kind, field):
-        def nearest():
+    @property
+    def ahead_u(self) -> Floats:
+        return self._nearest("ahead", "u")
+
+    @property
+    def merge_x(self) -> Floats:
+        return self._nearest("merge", "x")
+
+    @property
+    def merge_v(self) -> Floats:
+        return self._nearest("merge", "v")
+
+    @property
+    def merge_u(self) -> Floats:
+        return self._nearest("merge", "u")
+
+    @property
+    def merge_at(self) -> Floats:
+        return self._nearest("merge", "at")
+
+    @property
+    def partners(self) -> list[list[Partner]]:
+        if self._partners_now is None:
+            self._partners_now = self._partners.now(self.states, self.x)
+        return self._partners_now
+
+    def _nearest(self, kind: str, field: str) -> Floats:
+        def nearest() -> Floats:
             if kind == "ahead":
-                found = [min(_of(all_, True), key=lambda p: p.x, default=None) for all_ in self.partners]
+                found = [min(_of(all_, True), key=_where, default=None) for all_ in self.partners]
             else:
-                found = [min(_of(all_, False), key=lambda p: p.at, default=None) for all_ in self.partners]
+                found = [min(_of(all_, False), key=_where_met, default=None) for all_ in self.partners]
             return _array([NAN if p is None else getattr(p, field) for p in found])
 
         return self._once((kind, field), nearest)
@@ -144,8 +220,16 @@ class Partner(typing.NamedTuple):
     gap: float
 
 
-def _of(partners, ahead):
+def _of(partners: list[Partner], ahead: bool) -> list[Partner]:
     return [p for p in partners if (p.kind == s.CONSTRAINT_REAR_END) == ahead]
+
+
+def _where(partner: Partner) -> float:
+    return partner.x
+
+
+def _where_met(partner: Partner) -> float:
+    return partner.at
 
 
 class Partners:
@@ -154,7 +238,9 @@ class Partners:
     The slice keeps its shape until the zone's next event, and with that come new assignments.
     """
 
-    def __init__(self, states, own, assignments):
+    def __init__(
+        self, states: Sequence[s.VehicleState], own: list[int], assignments: Iterable[s.Assignment]
+    ) -> None:
         places = {int(states[i].vehicle): i for i in range(len(states))}
         order = {int(states[i].vehicle): n for n, i in enumerate(own)}
         self.terminal = [NAN] * len(own)
@@ -162,7 +248,7 @@ class Partners:
         self.scheduled_time = [NAN] * len(own)
         #: For each vehicle: place of the partner, its id, kind, distances of the point on the two paths, gap, and
         #: from which position of the partner on nothing is owed.
-        self._owed = [[] for _ in own]
+        self._owed: list[list[tuple[int, int, int, float, float, float, float]]] = [[] for _ in own]
         for a in assignments:
             k = order.get(a.vehicle)
             if k is None:
@@ -176,7 +262,7 @@ class Partners:
                 owed = (place, a.partner, a.kind, a.own_conflict_m, a.partner_conflict_m, a.gap_m, a.until_m)
                 self._owed[k].append(owed)
 
-    def now(self, states, own_x):
+    def now(self, states: typing.Any, own_x: Iterable[float]) -> list[list[Partner]]:
         """What is owed where the vehicles are: for each a list of `Partner`."""
         if numpy is None:
             at = [(r.x_m, r.v_mps, r.u_mps2) for r in states]
@@ -197,11 +283,11 @@ class Partners:
         return all_
 
 
-def _array(values):
-    return list(values) if numpy is None else numpy.array(values, dtype=float)
+def _array(values: list[float]) -> Floats:
+    return typing.cast("Floats", list(values)) if numpy is None else numpy.array(values, dtype=float)
 
 
-def structured(records):
+def structured(records: ctypes.Array[typing.Any]) -> typing.Any:
     """A ctypes array of records as a numpy structured array over the same memory, where there is numpy."""
     if numpy is None:
         return records
@@ -210,7 +296,7 @@ def structured(records):
     return numpy.ctypeslib.as_array(records)
 
 
-def frozen(values):
+def frozen(values: typing.Any) -> typing.Any:
     """The same, refusing to be written to, where that can be said of it."""
     if numpy is not None and isinstance(values, numpy.ndarray):
         values.setflags(write=False)
