@@ -32,6 +32,9 @@ pub use services::*;
 pub use state::*;
 pub use summary::*;
 
+/// The C header, as it is generated.
+pub const C_HEADER: &str = include_str!("../include/cz_schemas.h");
+
 #[cfg(not(target_endian = "little"))]
 compile_error!("frames are little-endian and are used in place");
 

@@ -5,18 +5,31 @@ use super::{AppError, print};
 use std::path::Path;
 
 /// Installed path and contents. Headers and build files are part of the program.
-const FILES: [(&str, &str); 4] = [
-    ("include/control_zones/cz_schemas.h", include_str!("../../ipc_schemas/include/cz_schemas.h")),
-    ("include/control_zones/plugin.h", include_str!("../../sdk/c/include/control_zones/plugin.h")),
-    ("include/control_zones/plugin.hpp", include_str!("../../sdk/c/include/control_zones/plugin.hpp")),
+const FILES: [(&str, &str); 6] = [
+    ("include/control_zones/cz_schemas.h", ipc_schemas::C_HEADER),
+    ("include/control_zones/plugin.h", include_str!("../../sdk/include/control_zones/plugin.h")),
+    ("include/control_zones/plugin.hpp", include_str!("../../sdk/include/control_zones/plugin.hpp")),
     (
         "lib/cmake/control-zones/control-zones-config.cmake",
-        include_str!("../../sdk/c/cmake/control-zones-config.cmake"),
+        include_str!("../../sdk/cmake/control-zones-config.cmake"),
     ),
+    (
+        "lib/cmake/control-zones/control-zones-config-version.cmake",
+        include_str!("../../sdk/cmake/control-zones-config-version.cmake"),
+    ),
+    ("lib/pkgconfig/control-zones.pc", include_str!("../../sdk/control-zones.pc")),
 ];
 
-/// The libraries, which are built next to this program.
-const LIBRARIES: [&str; 2] = ["libcontrol_zones_c.so", "libcontrol_zones_c.a"];
+/// The libraries, which are built next to this program: the shared one has its version in its name where it is
+/// installed.
+const SHARED: &str = "libcontrol_zones_c.so";
+const STATIC: &str = "libcontrol_zones_c.a";
+
+/// What of the version stands in the name by which programs ask for the library (sdk/c/build.rs).
+fn interface() -> String {
+    let [major, minor] = [env!("CARGO_PKG_VERSION_MAJOR"), env!("CARGO_PKG_VERSION_MINOR")];
+    if major == "0" { format!("0.{minor}") } else { major.to_owned() }
+}
 
 pub(super) fn sdk(command: &SdkCommand) -> Result<(), AppError> {
     let SdkCommand::Install { prefix } = command;
@@ -24,39 +37,35 @@ pub(super) fn sdk(command: &SdkCommand) -> Result<(), AppError> {
     let prefix = std::path::absolute(prefix).map_err(|e| failed(prefix, e))?;
     let program = std::env::current_exe().map_err(|e| failed(Path::new("cz"), e))?;
     let beside = program.parent().unwrap_or(Path::new("."));
-    let mut installed = Vec::new();
-    let write = |name: &str, contents: &[u8]| {
+    let mut installed: Vec<String> = Vec::new();
+    // Beside it, and then in its place: whoever runs with the old one keeps it.
+    let mut place = |name: &str, make: &dyn Fn(&Path) -> std::io::Result<()>| -> Result<(), AppError> {
         let path = prefix.join(name);
         if let Some(folder) = path.parent() {
             std::fs::create_dir_all(folder).map_err(|e| failed(folder, e))?;
         }
-        // Beside it, and then in its place: whoever runs with the old library keeps it.
         let new = path.with_extension(format!("new-{}", std::process::id()));
-        std::fs::write(&new, contents).map_err(|e| failed(&new, e))?;
-        std::fs::rename(&new, &path).map_err(|e| failed(&path, e))
+        make(&new).map_err(|e| failed(&new, e))?;
+        std::fs::rename(&new, &path).map_err(|e| failed(&path, e))?;
+        installed.push(format!("{}\n", path.display()));
+        Ok(())
     };
-    for library in LIBRARIES {
+    let (version, interface) = (env!("CARGO_PKG_VERSION"), interface());
+    let full = format!("{SHARED}.{version}");
+    for (library, name) in [(SHARED, full.as_str()), (STATIC, STATIC)] {
         let from = beside.join(library);
         let contents = std::fs::read(&from).map_err(|e| {
             let build = "build it with `cargo build --release -p control-zones-c`";
             AppError::Failed(format!("{}: {e}; {build}", from.display()))
         })?;
-        write(&format!("lib/{library}"), &contents)?;
-        installed.push(format!("lib/{library}"));
+        place(&format!("lib/{name}"), &|path: &Path| std::fs::write(path, &contents))?;
+    }
+    for link in [format!("{SHARED}.{interface}"), SHARED.to_owned()] {
+        place(&format!("lib/{link}"), &|path: &Path| std::os::unix::fs::symlink(&full, path))?;
     }
     for (name, contents) in FILES {
-        write(name, contents.as_bytes())?;
-        installed.push(name.to_owned());
+        let contents = contents.replace("@VERSION@", version).replace("@SONAME@", &interface);
+        place(name, &|path: &Path| std::fs::write(path, &contents))?;
     }
-    let pc = format!(
-        "prefix={}\n\nName: control-zones\nDescription: Controllers for Control Zones\nVersion: {}\n\
-         Cflags: -I${{prefix}}/include\n\
-         Libs: -L${{prefix}}/lib -Wl,-rpath,${{prefix}}/lib -lcontrol_zones_c\n\
-         Libs.private: -lpthread -ldl -lm\n",
-        prefix.display(),
-        env!("CARGO_PKG_VERSION")
-    );
-    write("lib/pkgconfig/control-zones.pc", pc.as_bytes())?;
-    installed.push("lib/pkgconfig/control-zones.pc".to_owned());
-    print(&installed.iter().map(|name| format!("{}\n", prefix.join(name).display())).collect::<String>())
+    print(&installed.concat())
 }

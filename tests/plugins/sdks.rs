@@ -163,7 +163,7 @@ fn sdk_install_installs_all_it_says_and_otherwise_says_what_to_build() {
     let output = cz().args(["sdk", "install", "--prefix"]).arg(prefix).output().unwrap();
     assert!(output.status.success(), "{output:?}");
     let said = String::from_utf8(output.stdout).unwrap();
-    assert_eq!(said.lines().count(), 7, "{said}");
+    assert_eq!(said.lines().count(), 10, "{said}");
     for file in said.lines() {
         assert!(std::fs::metadata(file).unwrap().len() > 0, "{file} is empty");
     }
@@ -178,6 +178,50 @@ fn sdk_install_installs_all_it_says_and_otherwise_says_what_to_build() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("libcontrol_zones_c.so: "), "{said}");
     assert!(said.contains("cargo build --release -p control-zones-c"), "{said}");
+}
+
+/// What a command prints; it must succeed.
+fn output_of(command: &mut Command) -> String {
+    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+    assert!(output.status.success(), "{command:?}: {}", String::from_utf8_lossy(&output.stderr));
+    String::from_utf8(output.stdout).unwrap()
+}
+
+#[test]
+fn the_c_package_may_be_moved_and_programs_ask_for_its_interface_by_version() {
+    if Command::new("pkg-config").arg("--version").output().is_err() {
+        assert!(std::env::var_os("CI").is_none(), "pkg-config is not installed");
+        eprintln!("skipped: pkg-config is not installed");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let (before, prefix) = (folder.path().join("before"), folder.path().join("after"));
+    installed(); // builds the library
+    cz().args(["sdk", "install", "--prefix"]).arg(&before).assert().success();
+    std::fs::rename(&before, &prefix).unwrap();
+    let flags = |arguments: &[&str]| {
+        let mut command = Command::new("pkg-config");
+        command.env("PKG_CONFIG_PATH", prefix.join("lib/pkgconfig")).args(arguments).arg("control-zones");
+        output_of(&mut command).split_whitespace().map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(flags(&["--modversion"]), [env!("CARGO_PKG_VERSION")]);
+    let program = folder.path().join("headway");
+    let mut compiler = Command::new("cc");
+    compiler.arg(root().join("examples/c/headway.c")).args(flags(&["--cflags", "--libs"]));
+    output_of(compiler.args(["-lm", "-o"]).arg(&program));
+    // It finds the library where it is now, and says itself that it was not started by a run.
+    let ended = Command::new(&program).env_remove("CZ_RUN").env_remove("CZ_CONTROLLER").output().unwrap();
+    let said = String::from_utf8_lossy(&ended.stderr);
+    assert!(ended.status.code() == Some(1) && said.contains("CZ_RUN"), "{ended:?}");
+    let needed = output_of(Command::new("readelf").arg("--dynamic").arg(&program));
+    let version = env!("CARGO_PKG_VERSION").rsplit_once('.').unwrap().0;
+    let name = format!("libcontrol_zones_c.so.{version}]");
+    assert!(needed.lines().any(|line| line.contains("NEEDED") && line.contains(&name)), "{needed}");
+    let cmake = prefix.join("lib/cmake/control-zones");
+    for file in ["control-zones-config.cmake", "control-zones-config-version.cmake"] {
+        let text = std::fs::read_to_string(cmake.join(file)).unwrap();
+        assert!(text.contains(env!("CARGO_PKG_VERSION")) && !text.contains("@V"), "{file}: {text}");
+    }
 }
 
 #[test]
@@ -214,8 +258,8 @@ fn documented_controllers_run_as_printed_within_limits_and_without_a_shield() {
     // The documentation of the Rust package prints this example.
     let mut all = vec![("sdk/rust/src/lib.rs", rust("cruise"))];
     for (name, file, margin) in [
-        ("printed_c.c", "sdk/c/include/control_zones/plugin.h", " *     "),
-        ("printed_cpp.cpp", "sdk/c/include/control_zones/plugin.hpp", "//     "),
+        ("printed_c.c", "sdk/include/control_zones/plugin.h", " *     "),
+        ("printed_cpp.cpp", "sdk/include/control_zones/plugin.hpp", "//     "),
     ] {
         all.push((file, compiled(&written(name, printed(file, margin, "#include")), folder.path())));
     }

@@ -1,4 +1,4 @@
-//! The C ABI of `control-zones-plugin`; declared in `include/control_zones/plugin.h`, by hand, and held to
+//! The C ABI of `control-zones-plugin`; declared in `sdk/include/control_zones/plugin.h`, by hand, and held to
 //! it by the assertions in both and by `examples/run_all.sh`, which compiles and runs programs against it.
 //!
 //! The only crate of the project with unsafe interfaces. Their common argument: a handle comes from

@@ -1,0 +1,22 @@
+# Fits whoever asks for this version or an older one with the same interface: before 1.0, of the same minor version.
+set(PACKAGE_VERSION "@VERSION@")
+set(_cz_interface "@SONAME@")
+if(PACKAGE_FIND_VERSION_COUNT EQUAL 0)
+  set(PACKAGE_VERSION_COMPATIBLE TRUE)
+elseif(PACKAGE_FIND_VERSION_COUNT EQUAL 1 OR NOT PACKAGE_FIND_VERSION_MAJOR EQUAL 0)
+  set(_cz_asked "${PACKAGE_FIND_VERSION_MAJOR}")
+  string(REGEX REPLACE "\\..*" "" _cz_interface "${_cz_interface}")
+else()
+  set(_cz_asked "${PACKAGE_FIND_VERSION_MAJOR}.${PACKAGE_FIND_VERSION_MINOR}")
+endif()
+if(PACKAGE_FIND_VERSION_COUNT GREATER 0 AND _cz_asked STREQUAL _cz_interface
+   AND NOT PACKAGE_FIND_VERSION VERSION_GREATER PACKAGE_VERSION)
+  set(PACKAGE_VERSION_COMPATIBLE TRUE)
+endif()
+if(PACKAGE_FIND_VERSION VERSION_EQUAL PACKAGE_VERSION)
+  set(PACKAGE_VERSION_EXACT TRUE)
+endif()
+# The library is for 64 bits.
+if(NOT CMAKE_SIZEOF_VOID_P STREQUAL "" AND NOT CMAKE_SIZEOF_VOID_P EQUAL 8)
+  set(PACKAGE_VERSION_UNSUITABLE TRUE)
+endif()
