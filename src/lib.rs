@@ -18,6 +18,7 @@ pub mod reproduce;
 pub mod scenario;
 pub mod shield;
 pub mod step;
+pub mod trace;
 pub mod transport;
 pub mod vehicle;
 pub mod world;

@@ -50,3 +50,16 @@ fn arguments_and_exit_code_go_through_as_they_are() {
     let said = String::from_utf8(output.stdout).unwrap();
     assert_eq!((output.status.code(), said.as_str()), (Some(7), "a b.czlog|--to|fcd|--help|-V|--|--out|"));
 }
+
+#[test]
+fn a_run_with_a_view_is_started_by_the_view() {
+    let _alone = ALONE.lock();
+    let directory = tempfile::tempdir().unwrap();
+    let program = alone(directory.path());
+    let sibling = directory.path().join("cz-view");
+    std::fs::write(&sibling, "#!/bin/sh\nprintf '%s|' \"$@\"\n").unwrap();
+    std::fs::set_permissions(&sibling, PermissionsExt::from_mode(0o755)).unwrap();
+    let output = run(&program, &["run", "--pace", "realtime", "--view", "intersection", "--seed", "2"]);
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert_eq!(said, "--|--pace|realtime|intersection|--seed|2|");
+}

@@ -3,7 +3,7 @@
 use crate::walk::Moment;
 use control_zones::conflict::{Conflicts, DutyKind};
 use control_zones::record::words::zone_name;
-use control_zones::record::{Condition, Owed};
+use control_zones::record::{Condition, Owed, RunEvent, RunEventKind};
 use control_zones::scenario::{Scenario, ShieldMode, VehicleParams};
 use control_zones::vehicle::{Inequality, satisfiable_at};
 use ipc_schemas::{STATE_ENTERED, VERDICT_FE, VERDICT_INFEASIBLE, VehicleCommand};
@@ -25,10 +25,14 @@ pub enum EventKind {
     Infeasible,
     /// A vehicle did something else than it was commanded.
     Overruled,
-    /// A controller did not answer in time.
+    /// A process did not answer in time.
     Late,
-    /// A controller was replaced.
+    /// A process was replaced.
     Replaced,
+    /// Frames were refused.
+    Refused,
+    /// Somebody steered the run.
+    Steered,
 }
 
 impl EventKind {
@@ -42,6 +46,8 @@ impl EventKind {
             EventKind::Overruled => "overruled",
             EventKind::Late => "late",
             EventKind::Replaced => "replaced",
+            EventKind::Refused => "refused",
+            EventKind::Steered => "steered",
         }
     }
 }
@@ -238,8 +244,35 @@ impl<'a> Events<'a> {
         }
     }
 
-    /// All of them, by first step.
-    pub fn finish(mut self) -> Vec<Event> {
+    /// All of them, by first step; with what the recording's end says, but for what is known by the steps.
+    pub fn finish(mut self, happened: &[RunEvent]) -> Vec<Event> {
+        for RunEvent { step, kind, text } in happened {
+            let kind = match kind {
+                RunEventKind::Missed => EventKind::Late,
+                RunEventKind::Refused => EventKind::Refused,
+                RunEventKind::Replaced => EventKind::Replaced,
+                RunEventKind::Steered => EventKind::Steered,
+            };
+            let is_known = |known: &Event| {
+                let whom = |controller| text.contains(&format!("controller {controller}"));
+                known.kind == kind
+                    && (known.first_step..=known.last_step).contains(step)
+                    && known.controller.is_some_and(whom)
+            };
+            if !self.all.iter().any(is_known) {
+                self.all.push(Event {
+                    kind,
+                    first_step: *step,
+                    last_step: *step,
+                    time_s: self.scenario.time_s(*step),
+                    vehicle: None,
+                    zone: None,
+                    partner: None,
+                    controller: None,
+                    reason: text.clone(),
+                });
+            }
+        }
         self.all.sort_by_key(|event| (event.first_step, event.kind));
         self.all
     }

@@ -217,7 +217,7 @@ pub fn write<S: Source>(path: &Path, reader: &Reader<S>) -> Result<Ended, OutErr
         }
         Ok(())
     })?;
-    slices(&mut writer, scenario, &zones, &trips, &events.finish())?;
+    slices(&mut writer, scenario, &zones, &trips, &events.finish(reader.events()))?;
     writer.out.finish()?;
     Ok(ended)
 }
@@ -248,7 +248,7 @@ fn slices(
         by_vehicle.entry((passage.visit.zone, passage.visit.vehicle)).or_default().push(courses.len());
         courses.push(course(writer, scenario, zones, passage)?);
     }
-    let controllers = writer.track("controllers".to_owned(), None, None)?;
+    let controllers = writer.track("processes".to_owned(), None, None)?;
     for event in events {
         let instant = TrackEvent {
             r#type: Some(INSTANT),
@@ -257,7 +257,7 @@ fn slices(
             categories: vec!["event".to_owned()],
             ..TrackEvent::default()
         };
-        if matches!(event.kind, EventKind::Late | EventKind::Replaced) {
+        if event.vehicle.is_none() {
             writer.event(event.time_s, instant)?;
             continue;
         }

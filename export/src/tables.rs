@@ -222,7 +222,7 @@ pub fn write<R: Source, S: Sink>(reader: &Reader<R>, mut sheets: Sheets<S>) -> R
     let [.., visits, vehicles, happened, run] = &mut sheets;
     visit_rows(visits, scenario, &trips)?;
     vehicle_rows(vehicles, &places, &trips)?;
-    events.finish().iter().try_for_each(|event| happened.row(&event_row(event)))?;
+    events.finish(reader.events()).iter().try_for_each(|event| happened.row(&event_row(event)))?;
     for (key, value) in facts(reader, &ended) {
         run.row(&[Value::Text(key.to_owned()), Value::Text(value)])?;
     }

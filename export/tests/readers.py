@@ -169,5 +169,22 @@ def perfetto(path):
             "counters": counters, "inner": inner}
 
 
+def processes(path):
+    """What `cz run --trace` writes, by Perfetto's own trace processor, which its package fetches when it is first used."""
+    need("perfetto.trace_processor")
+    from perfetto.trace_processor import TraceProcessor
+    try:
+        processor = TraceProcessor(trace=str(path))
+    except Exception as error:
+        print(f"no trace processor: {error}", file=sys.stderr)
+        sys.exit(3)
+    spans = "select process.name as process, slice.name as name, count(*) as spans, sum(slice.dur) as dur from slice " \
+        "join thread_track on slice.track_id = thread_track.id join thread using (utid) join process using (upid) " \
+        "where slice.dur > 0 group by 1, 2"
+    lost = "select sum(value) as lost from stats where severity in ('error', 'data_loss')"
+    return {"spans": {f"{row.process}: {row.name}": row.spans for row in processor.query(spans)},
+            "lost": next(iter(processor.query(lost))).lost or 0}
+
+
 if __name__ == "__main__":
     print(json.dumps(globals()[sys.argv[1]](Path(sys.argv[2]))))

@@ -19,10 +19,14 @@ fn read_back(recording: &Recording, format: Format, name: &str) -> Option<Value>
     let ended = write(&recording.reader(), format, &out).unwrap();
     assert_eq!((ended.steps, ended.lost, ended.damage.len()), (recording.steps, None, 0));
     assert_eq!(ended.summary.as_ref(), Some(&recording.summary));
+    read_by(&format!("{format:?}").to_lowercase(), &out)
+}
+
+/// Has a file read; `None` where there is no reader.
+fn read_by(what: &str, file: &Path) -> Option<Value> {
     let python = std::env::var("CZ_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/readers.py");
-    let what = format!("{format:?}").to_lowercase();
-    let output = Command::new(&python).arg(script).arg(&what).arg(&out).stdin(Stdio::null()).output();
+    let output = Command::new(&python).arg(script).arg(what).arg(file).stdin(Stdio::null()).output();
     let said = |bytes: &[u8]| String::from_utf8_lossy(bytes).trim().to_owned();
     match output {
         Ok(output) if output.status.success() => Some(serde_json::from_slice(&output.stdout).unwrap()),
@@ -142,4 +146,33 @@ fn perfetto_reads_the_trace() {
     assert_eq!(said["vehicles"], recording.summary.departed);
     assert!(near(&said["energy"], recording.energy), "{said} has not {}", recording.energy);
     assert!(said["counters"].as_u64() > Some(0) && said["inner"].as_u64() > Some(0), "{said}");
+}
+
+#[test]
+fn perfetto_reads_what_processes_did() {
+    let program = Path::new(env!("CARGO_BIN_EXE_cz-export")).with_file_name("cz");
+    if !program.is_file() {
+        eprintln!(
+            "{} is not built: no run can be traced (cargo test --workspace builds it)",
+            program.display()
+        );
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("a.json");
+    let run = Command::new(program)
+        .args(["run", "--set", "end.vehicles=10", "--json", "-", "--trace"])
+        .arg(&file)
+        .output()
+        .unwrap();
+    assert!(run.status.success(), "{run:?}");
+    let summary: Value = serde_json::from_slice(&run.stdout).unwrap();
+    let Some(said) = read_by("processes", &file) else { return };
+    assert_eq!(said["lost"], 0, "{said}");
+    assert_eq!(said["spans"]["controller 0: publish"], summary["steps"], "{said}");
+    for name in
+        ["world: compute", "world: publish", "world: wait", "coordinator 0: wait", "controller 0: compute"]
+    {
+        assert!(said["spans"][name].as_u64() > Some(0), "{name}: {said}");
+    }
 }

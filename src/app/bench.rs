@@ -47,6 +47,10 @@ pub(super) fn bench(args: &BenchArgs) -> Result<(), AppError> {
             let report = super::bench_wait::measure(args)?;
             deliver(args.measure.json.as_deref(), &report, &super::bench_wait::table(&report))
         }
+        BenchKind::View(args) => {
+            let report = super::bench_view::measure(args)?;
+            deliver(args.measure.json.as_deref(), &report, &super::bench_view::table(&report))
+        }
         BenchKind::Peer(args) => peer(args),
     }
 }

@@ -46,7 +46,7 @@ pub(super) fn network(scenario: &Scenario, path: &Path) -> Result<(), AppError> 
 struct Picture {
     lanes: Vec<(Vec<Place>, RGBColor)>,
     /// Between an exit and the entrance it leads to.
-    links: Vec<[Place; 2]>,
+    links: Vec<Vec<Place>>,
     points: Vec<(Place, PointKind, String)>,
     labels: Vec<(Place, String, RGBColor)>,
 }
@@ -155,8 +155,8 @@ impl Picture {
                 ("sans-serif", size).into_font().color(&color).pos(Pos::new(HPos::Center, VPos::Bottom));
             area.draw(&Text::new(text.to_owned(), (place.0, place.1 - 6), style))
         };
-        for [from, to] in &self.links {
-            if let Some(line) = view.line(*from, *to) {
+        for piece in self.links.iter().flat_map(|link| link.windows(2)) {
+            if let Some(line) = view.line(piece[0], piece[1]) {
                 area.draw(&PathElement::new(line.to_vec(), LANE.mix(0.4).stroke_width(2)))?;
             }
         }

@@ -41,6 +41,7 @@ pub(super) fn run_as(
         conduct,
         run_id: new_run_id(),
         resume: None,
+        trace: None,
     };
     let words = |e: AppError| e.to_string();
     let recording = match record {

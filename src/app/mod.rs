@@ -3,6 +3,7 @@
 mod args;
 mod bench;
 mod bench_law;
+mod bench_view;
 mod bench_wait;
 mod clean;
 mod controllers;

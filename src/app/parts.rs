@@ -12,6 +12,7 @@ use crate::process::{
     first_missing_step, new_run_id, run_controller, run_coordinator, run_world,
 };
 use crate::scenario::scenario_hash;
+use crate::trace::Tracing;
 use crate::transport::iox::RunName;
 use crate::world::World;
 use ipc_schemas::Role;
@@ -23,6 +24,7 @@ use std::time::{Duration, Instant};
 const REPORT_EVERY: Duration = Duration::from_millis(50);
 
 pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
+    let _tracing = Tracing::begin("world");
     let resume = args.resume.as_deref().map(record::open).transpose()?;
     let (scenario, share) = match &resume {
         None => (Arc::new(args.scenario.load()?), args.share),
@@ -86,7 +88,10 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     };
     let recorded = match observation {
         Some(observation) => match observation.stop() {
-            Ok(recording) => recording.finish(&outcome),
+            Ok(mut recording) => {
+                outcome.iter().for_each(|outcome| recording.happened(&outcome.events));
+                recording.finish(&outcome)
+            }
             Err(error) => Err(error.into()),
         },
         None => Ok(()),
@@ -122,6 +127,8 @@ fn part(
     role: Role,
     run: impl FnOnce(&RunName, Conduct<'_>) -> Result<(), ProcessError>,
 ) -> Result<(), AppError> {
+    let index = args.index.map_or_else(String::new, |index| format!(" {index}"));
+    let _tracing = Tracing::begin(&format!("{role}{index}"));
     let (joining, stop) = prepare(args, role)?;
     let report = report_to(args.supervised, &args.wait);
     let (settling, refused) = (settling(&args.wait, &*report), refused_to(args));

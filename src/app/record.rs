@@ -5,7 +5,7 @@ use super::say::{number, say};
 use super::{AppError, print};
 use crate::process::RecordLag;
 use crate::record::{
-    Build, FileSource, Flaw, Metadata, Processes, Reader, RecordError, Recorder, Replay, RunEnd,
+    Build, FileSource, Flaw, Metadata, Processes, Reader, RecordError, Recorder, Replay, RunEnd, RunEvent,
     ScenarioSource, StepFrames, Stop, compare, replay as replay_roles,
 };
 use crate::scenario::{Scenario, text_of};
@@ -121,6 +121,11 @@ impl Recording {
         if let Some(error) = &self.failure {
             say(format_args!("cz: {error}; the run goes on without being recorded"));
         }
+    }
+
+    /// What happened to the run beside its steps.
+    pub fn happened(&mut self, events: &[RunEvent]) {
+        self.recorder.happened(events.to_vec());
     }
 
     /// Ends the recording and says on stderr what is in it.

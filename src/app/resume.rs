@@ -53,6 +53,7 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         conduct: args.supervised.conduct,
         run_id: new_run_id(),
         resume: Some((&args.file, first)),
+        trace: None,
     };
     let lag = args.supervised.conduct.record_lag();
     let recording = match &args.record {

@@ -53,6 +53,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         conduct: args.supervised.conduct,
         run_id: new_run_id(),
         resume: None,
+        trace: args.trace.as_deref(),
     };
     let recording = match &args.record {
         Some(path) => {

@@ -11,6 +11,7 @@ mod socket;
 mod solver;
 mod step;
 mod sumo;
+mod viewed;
 mod waiting;
 
 pub use latency::{LatencyOptions, LatencyReport, latency, two_processes};
@@ -20,6 +21,8 @@ pub use scale::{ScaleOptions, ScaleReport, scale};
 pub use side_by_side::{Family, side_by_side};
 pub use solver::{SolverReport, solver};
 pub use sumo::{Sumo, SumoSide};
+pub use viewed::{Seen, ViewedOptions, ViewedPoint, ViewedReport, look, viewed};
+pub(crate) use waiting::median;
 pub use waiting::{NINE, Side, THREE, Timed, WaitingOptions, WaitingPoint, WaitingReport, waiting};
 
 use crate::lockstep::LockstepError;

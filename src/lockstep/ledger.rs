@@ -62,6 +62,8 @@ impl Handover {
 pub struct Ledger {
     audiences: Vec<Audience>,
     in_force: Vec<Vec<Assignment>>,
+    /// Whether what is in force in a zone is news to whoever is shown a step now and then.
+    is_news: Vec<bool>,
     /// Per zone, the last summaries of each neighbour it acted on.
     heard: Vec<Vec<(u32, Vec<ZoneSummary>)>>,
     due: Vec<ZoneSummary>,
@@ -85,6 +87,7 @@ impl Ledger {
         Ledger {
             audiences: (0..zones as u32).map(|zone| Audience::of(scenario, zone)).collect(),
             in_force: vec![Vec::new(); zones],
+            is_news: vec![false; zones],
             heard: (0..zones as u32)
                 .map(|zone| network.neighbours(zone).map(|next| (next, Vec::new())).collect())
                 .collect(),
@@ -143,6 +146,7 @@ impl Ledger {
                 let Some(zone) = self.in_force.get_mut(group[0].zone as usize) else { continue };
                 zone.clear();
                 zone.extend_from_slice(group);
+                self.is_news[group[0].zone as usize] = true;
             }
         }
         self.spare.extend(self.coordination.drain(..).map(|(_, assignments)| assignments));
@@ -150,6 +154,17 @@ impl Ledger {
             std::mem::swap(before, now);
             now.clear();
         }
+    }
+
+    /// What is in force in zones where it is news, zones ascending; it is none after this.
+    pub fn news(&mut self) -> Vec<&[Assignment]> {
+        let zones = self.in_force.iter().zip(&mut self.is_news);
+        zones.filter_map(|(zone, is_news)| std::mem::take(is_news).then_some(&zone[..])).collect()
+    }
+
+    /// What is in force is news everywhere.
+    pub fn untell(&mut self) {
+        self.is_news.fill(true);
     }
 
     /// Enters a whole step, of a run that goes on from a recording.

@@ -7,6 +7,7 @@
 mod controller;
 mod coordinator;
 pub mod in_process;
+mod kept;
 mod ledger;
 mod members;
 mod refusals;
@@ -54,7 +55,13 @@ pub struct Awaited {
 impl Awaited {
     /// What is awaited, in words.
     pub fn named(&self, names: &ControllerNames) -> String {
-        let Awaited { role, missing, what, step } = *self;
+        let Awaited { what, step, .. } = *self;
+        format!("{what} of step {step} from {}", self.senders(names))
+    }
+
+    /// From whom.
+    pub fn senders(&self, names: &ControllerNames) -> String {
+        let Awaited { role, missing, .. } = *self;
         let of = |index| match role {
             Role::Controller => names.of(index),
             role => format!("{role} {index}"),
@@ -63,7 +70,7 @@ impl Awaited {
             Role::World => vec!["the world".to_owned()],
             _ => (0..64).filter(|i| missing >> i & 1 == 1).map(of).collect(),
         };
-        format!("{what} of step {step} from {}", senders.join(", "))
+        senders.join(", ")
     }
 }
 

@@ -3,6 +3,7 @@
 use super::Identity;
 use crate::control::pool::PoolError;
 use crate::scenario::ControllerNames;
+use crate::trace;
 use crate::world::CommandFault;
 use ipc_schemas::{FrameHeader, HeaderFault, Role};
 use serde::{Deserialize, Serialize};
@@ -142,9 +143,15 @@ impl Refusals {
                 self.accounts.last_mut().expect("one was added")
             }
         };
+        trace::note(|| format!("frame refused: {refusal}"));
         account.frames += 1;
         account.last = refusal;
         account.process_id
+    }
+
+    /// Of how many senders.
+    pub fn senders(&self) -> usize {
+        self.accounts.len()
     }
 
     /// All of it, as refused by this receiver.

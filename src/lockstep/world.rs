@@ -1,5 +1,6 @@
 //! The world's side of a step: publish the state, collect the commands, integrate.
 
+use super::kept::KeptStep;
 use super::members::check_sender;
 use super::refusals::Refusals;
 use super::{
@@ -9,7 +10,7 @@ use super::{
 use crate::scenario::ControllerNames;
 use crate::scenario::share::zones_of;
 use crate::step::{CommandPart, POLICY_NONE, StepFrames};
-use crate::transport::{Frame, Inbox, Loan, Outbox, Slots};
+use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
 use crate::world::{Sheet, World};
 use ipc_schemas::{
     Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, Member, Role, VehicleCommand,
@@ -57,10 +58,10 @@ where
     /// The verdict of what was put in.
     put_in_verdict: u16,
     observer: Option<Box<dyn Observer>>,
-    /// Whether the observer is shown anything.
-    shows: bool,
     /// The records of the state published last, for the observer.
     published: Vec<VehicleState>,
+    /// A step that is shown once it is over.
+    kept: KeptStep,
     phase: Phase,
 }
 
@@ -113,8 +114,8 @@ where
             put_in: 0,
             put_in_verdict: 0,
             observer: None,
-            shows: true,
             published: Vec::new(),
+            kept: KeptStep::default(),
             phase: Phase::Publish,
         }
     }
@@ -124,9 +125,29 @@ where
         self.observer = Some(observer);
     }
 
-    /// Whether steps are shown to the observer from the next one on; called between steps.
-    pub fn show_steps(&mut self, shows: bool) {
-        self.shows = shows;
+    /// Keeps the step whose state has been published last, to be shown when it is over; called while others work on
+    /// it. Needs the ledger.
+    pub fn keep_step(&mut self) {
+        let is_over = matches!(self.phase, Phase::Finished);
+        self.kept.keep(self.header, self.world.records(), self.world.state_hash(), is_over);
+    }
+
+    /// Shows the step that was kept, if there is one and it is over, whose coordination is then all that is in force in
+    /// the zones that acted since the last one that was shown; returns whether it did. To be called before the step
+    /// after it is over.
+    ///
+    /// # Errors
+    /// The observer's.
+    pub fn show_kept(&mut self, observer: &mut dyn Observer) -> Result<bool, TransportError> {
+        match &mut self.ledger {
+            Some(ledger) if self.kept.is_over() => self.kept.show(ledger, observer).map(|()| true),
+            _ => Ok(false),
+        }
+    }
+
+    /// Makes the step shown next say what is in force in every zone.
+    pub fn show_all_in_force(&mut self) {
+        self.ledger.iter_mut().for_each(Ledger::untell);
     }
 
     /// Keeps a ledger that has been begun already, in place of its own.
@@ -199,6 +220,11 @@ where
     /// What was refused, by sender.
     pub fn refused(&self) -> Vec<RefusedFrames> {
         self.refusals.report(&self.identity, &self.names())
+    }
+
+    /// Of how many senders something was refused.
+    pub fn refused_senders(&self) -> usize {
+        self.refusals.senders()
     }
 
     /// The number of answers that came too late or twice.
@@ -323,7 +349,7 @@ where
         let world = &mut self.world;
         let count = world.record_count();
         let loan = self.ports.state.loan(header, count, |slots| world.publish(slots))?;
-        if self.shows && self.observer.is_some() {
+        if self.observer.is_some() {
             self.published.clear();
             self.published.extend_from_slice(loan.records());
         }
@@ -371,9 +397,6 @@ where
     /// Shows the step to the observer, with the commands of so many controllers.
     fn show(&mut self, controllers: usize) -> Result<(), LockstepError> {
         let (Some(observer), Some(ledger)) = (&mut self.observer, &self.ledger) else { return Ok(()) };
-        if !self.shows {
-            return Ok(());
-        }
         let zones = self.world.scenario().network.zones.len() as u32;
         let count = self.coordinators.len() as u32;
         let process_of = |zone| (0..count).find(|&i| zones_of(zones, i, count).contains(&zone));
@@ -401,6 +424,7 @@ where
     fn finish_step(&mut self) -> Result<(), LockstepError> {
         let step = self.world.step();
         self.show(self.controllers.len())?;
+        self.kept.end(&self.controllers, self.put_in, self.put_in_verdict);
         self.world.advance().map_err(|vehicles| LockstepError::Uncommanded { step, vehicles })?;
         if let Some(ledger) = &mut self.ledger {
             ledger.end();

@@ -1,11 +1,14 @@
 //! Who is in a run, and who comes and goes; what the world does while it waits for them.
 
 use super::attach::{Readiness, Reception};
+use super::outcome::Events;
 use super::pace::Pacer;
 use super::services::{Driver, MembersDesk};
 use super::viewing::Viewing;
 use super::{OnMiss, Peer, Peers, ProcessError, Replacement, StopFlag, Waiter};
 use crate::lockstep::Awaited;
+use crate::record::RunEventKind;
+use crate::trace::{self, Phase};
 use ipc_schemas::Role;
 use std::time::Duration;
 
@@ -27,6 +30,8 @@ pub(super) struct House {
     pub viewing: Option<Viewing>,
     /// The step's deadline has passed, and this is the verdict of what is put in for whoever is missing.
     pub overdue: Option<u16>,
+    /// What has happened to the run so far.
+    pub events: Events,
     /// Who has died last and was not replaced yet.
     pub gone: Option<Peer>,
     /// Who has come since the last step ended.
@@ -46,6 +51,8 @@ impl House {
             if stop.is_set() {
                 return Err(ProcessError::Interrupted { step: Some(step) });
             }
+            trace::enter(Phase::Idle);
+            self.viewing.as_mut().map_or(Ok(()), |viewing| viewing.idle(driver, left))?;
             if left.is_zero() {
                 std::hint::spin_loop();
             } else {
@@ -54,6 +61,7 @@ impl House {
                 self.attend_views(driver)?;
             }
         }
+        trace::enter(Phase::Compute);
         self.pacer.begin(step);
         Ok(())
     }
@@ -66,6 +74,9 @@ impl House {
         awaited: Awaited,
     ) -> Result<(), ProcessError> {
         if self.pacer.has_missed(&awaited) {
+            let names = driver.names();
+            trace::note(|| format!("deadline missed: {}", awaited.named(&names)));
+            self.events.missed(awaited.step, awaited.senders(&names));
             match self.pacer.on_miss() {
                 OnMiss::Abort => {
                     let (step, awaited) = (awaited.step, awaited.named(&driver.names()));
@@ -113,9 +124,17 @@ impl House {
         self.replace && !is_plugin
     }
 
+    /// Shows steps to whoever looks, while others work on the one that has just been published.
+    pub(super) fn overlap_views(&mut self, driver: &mut Driver) -> Result<(), ProcessError> {
+        // Whoever asks for single steps wants to see each.
+        let is_asked_for = self.pacer.is_paused();
+        self.viewing.as_mut().map_or(Ok(()), |viewing| viewing.overlap(driver, is_asked_for))
+    }
+
     /// Sees to whoever looks; between two steps.
     pub(super) fn attend_views(&mut self, driver: &mut Driver) -> Result<(), ProcessError> {
-        self.viewing.as_mut().map_or(Ok(()), |viewing| viewing.attend(driver, &mut self.pacer))
+        let House { viewing, pacer, events, .. } = self;
+        viewing.as_mut().map_or(Ok(()), |viewing| viewing.attend(driver, pacer, events))
     }
 
     /// Sees to whoever has come.
@@ -132,7 +151,11 @@ impl House {
             }
             let Some(handover) = driver.handover(role, index) else { return Readiness::Later };
             if let Some(process_id) = seat.process_id {
-                arrived.push((Peer { role, index, process_id }, seat.generation));
+                let peer = Peer { role, index, process_id };
+                if seat.generation > 0 {
+                    trace::note(|| format!("{peer} has been replaced, generation {}", seat.generation));
+                }
+                arrived.push((peer, seat.generation));
             }
             Readiness::Now(Box::new(handover))
         })?;
@@ -145,9 +168,18 @@ impl House {
     }
 
     /// The replacements of a step that took so long.
-    pub(super) fn step_done(&mut self, ns: u64) -> impl Iterator<Item = Replacement> + '_ {
+    pub(super) fn step_done(
+        &mut self,
+        driver: &Driver,
+        ns: u64,
+    ) -> impl Iterator<Item = Replacement> + use<'_> {
         let step = self.reception.first_step;
         let step_ms = ns as f64 / 1e6;
+        self.events.refused(step, driver.refused_senders(), || driver.refused());
+        for (peer, generation) in self.arrived.iter().filter(|(_, generation)| *generation > 0) {
+            let text = format!("{peer} was replaced: generation {generation}");
+            self.events.say(step, RunEventKind::Replaced, text);
+        }
         self.arrived.drain(..).filter(|(_, generation)| *generation > 0).map(move |(peer, generation)| {
             Replacement { participant: peer.to_string(), generation, step, step_ms }
         })

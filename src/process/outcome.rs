@@ -2,6 +2,7 @@
 
 use super::{Punctuality, Settled};
 use crate::lockstep::RefusedFrames;
+use crate::record::{RunEvent, RunEventKind};
 use crate::world::{World, WorldSummary};
 use hdrhistogram::Histogram;
 use serde::{Deserialize, Serialize};
@@ -53,6 +54,9 @@ pub struct Outcome {
     pub refused: Vec<RefusedFrames>,
     /// Answers that came too late or twice.
     pub late_frames: u64,
+    /// What happened to the run beside its steps, in order: the first thousand of it.
+    #[serde(default)]
+    pub events: Vec<RunEvent>,
     /// How punctual the run was, where it had a schedule or deadlines.
     pub punctuality: Option<Punctuality>,
     /// Where each process was and what it was granted; filled in by who started them.
@@ -188,6 +192,7 @@ impl StepMeter {
             replacements: history.replacements,
             refused: history.refused,
             late_frames: history.late_frames,
+            events: history.events,
             punctuality: history.punctuality,
             placement: Vec::new(),
         }
@@ -210,5 +215,55 @@ pub(super) struct History {
     pub replacements: Vec<Replacement>,
     pub refused: Vec<RefusedFrames>,
     pub late_frames: u64,
+    pub events: Vec<RunEvent>,
     pub punctuality: Option<Punctuality>,
+}
+
+/// Events kept of a run at most.
+const MOST_EVENTS: usize = 1000;
+
+/// What happens to a run, as it comes.
+#[derive(Debug, Default)]
+pub(super) struct Events {
+    all: Vec<RunEvent>,
+    /// The last step somebody missed, and who.
+    missed: Option<(u64, String)>,
+    /// Senders of whom frames were refused, by number.
+    refused: usize,
+}
+
+impl Events {
+    pub fn say(&mut self, step: u64, kind: RunEventKind, text: impl Into<String>) {
+        if self.all.len() < MOST_EVENTS {
+            self.all.push(RunEvent { step, kind, text: text.into() });
+        }
+    }
+
+    /// Somebody was not in time; news only where it was the step before.
+    pub fn missed(&mut self, step: u64, awaited: String) {
+        let is_news = self.missed.as_ref().is_none_or(|(last, who)| step > last + 1 || *who != awaited);
+        if is_news {
+            self.say(step, RunEventKind::Missed, format!("not in time: {awaited}"));
+        }
+        self.missed = Some((step, awaited));
+    }
+
+    /// So many senders have sent what was refused; those not known yet are news.
+    pub fn refused(&mut self, step: u64, senders: usize, report: impl FnOnce() -> Vec<RefusedFrames>) {
+        if senders > self.refused {
+            for refused in report().into_iter().skip(self.refused) {
+                self.say(step, RunEventKind::Refused, refused.to_string());
+            }
+            self.refused = senders;
+        }
+    }
+
+    /// Those behind so many.
+    pub fn since(&self, told: usize) -> &[RunEvent] {
+        self.all.get(told..).unwrap_or_default()
+    }
+
+    pub fn take(&mut self) -> Vec<RunEvent> {
+        std::mem::take(&mut self.all)
+    }
 }

@@ -186,8 +186,8 @@ impl Pacer {
         }
     }
 
-    /// Does what somebody who steers the run asks for, between two steps.
-    pub fn steer(&mut self, steering: Steering, step: u64) {
+    /// Does what somebody who steers the run asks for, between two steps; `false` where that is nothing it can do.
+    pub fn steer(&mut self, steering: Steering, step: u64) -> bool {
         match steering {
             Steering::Pause => (self.is_paused, self.granted) = (true, 0),
             Steering::Resume if self.is_paused => {
@@ -204,8 +204,9 @@ impl Pacer {
                 self.step_length = self.dt.div_f64(pace);
                 self.origin = Some((Instant::now(), step));
             }
-            Steering::Pace(_) => {}
+            Steering::Pace(_) => return false,
         }
+        true
     }
 
     /// Whether no step begins until somebody says so.

@@ -1,25 +1,26 @@
 //! Looking at a run while it goes on, from another process, and steering it: for views, not for recordings.
 //!
-//! Whoever looks gets steps as they come, and loses some when it is too slow; the run never waits for it, and as long
-//! as nobody looks it does nothing for anybody. Who the run is of, is in a file beside the run's others.
+//! Whoever looks gets steps when they are over: while no step is due, or, in a run that goes as fast as it can, some of
+//! them, while others work on the next one. It loses some when it is too slow; the run never waits for it, and as long
+//! as nobody looks it does nothing for anybody. What the run is of, is in a file beside the run's others.
 
-use super::observe::ObservedSteps;
+use super::outcome::Events;
 use super::pace::Pacer;
 use super::services::Driver;
 use super::{MissedBy, ProcessError};
 use crate::encoding;
-use crate::lockstep::Observer;
-use crate::record::{Metadata, Processes, ScenarioSource};
+use crate::lockstep::{LockstepError, Observer};
+use crate::record::{Metadata, Processes, RunEvent, RunEventKind, ScenarioSource};
 use crate::scenario::{Scenario, kept};
 use crate::step::{Step, StepFrames};
+use crate::trace;
 use crate::transport::TransportError;
 use crate::transport::iox::{
-    Block, BlockInbox, BlockOutbox, RunName, RunSpace, SpaceError, SteeringInbox, SteeringOutbox,
+    Block, BlockInbox, BlockOutbox, Condition, Leftover, RunName, RunSpace, SpaceError, SteeringInbox,
+    SteeringOutbox, clean,
 };
 use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState};
 use serde::{Deserialize, Serialize};
-use std::cell::Cell;
-use std::rc::Rc;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -62,8 +63,12 @@ pub struct Notice {
     pub missed_by: Vec<MissedBy>,
     /// Frames that were refused, in words.
     pub refused: Vec<String>,
+    /// What has happened since the last notice.
+    pub events: Vec<RunEvent>,
     /// Answers that came too late or twice.
     pub late_frames: u64,
+    /// Steps not shown since somebody has begun to look, for they would have taken too much of the run's time.
+    pub left_out_steps: u64,
     /// Whether it makes no step until told.
     pub is_paused: bool,
     /// So many times real time; 0 as fast as it can.
@@ -97,36 +102,56 @@ pub enum Steering {
     Pace(f64),
 }
 
+/// Showing steps of a run that goes as fast as it can takes this share of the time at most, one in so many.
+const SHARE: u32 = 20;
+/// Among so many steps shown one says what is in force in every zone, for whoever has lost some.
+const ALL_IN_FORCE_EVERY: u32 = 64;
+
+impl std::fmt::Display for Steering {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Steering::Pause => f.write_str("steered: pause"),
+            Steering::Resume => f.write_str("steered: go on"),
+            Steering::Step(1) => f.write_str("steered: one step"),
+            Steering::Step(steps) => write!(f, "steered: {steps} steps"),
+            Steering::Pace(0.0) => f.write_str("steered: as fast as it can"),
+            Steering::Pace(pace) => write!(f, "steered: {pace} times real time"),
+        }
+    }
+}
+
 /// The world's side.
 #[derive(Debug)]
 pub(super) struct Viewing {
-    steps: Rc<BlockOutbox>,
+    steps: BlockOutbox,
     notices: BlockOutbox,
     steering: Option<SteeringInbox>,
     /// When a run that somebody has paused goes on, if nobody looks.
     left_at: Instant,
-    is_watched: Rc<Cell<bool>>,
-    is_recorded: bool,
+    is_watched: bool,
+    /// When a step may be shown again; before, those that begin are left out.
+    next_at: Instant,
+    /// How long it took to keep the step that is kept, and to show the last one.
+    keeping: Duration,
+    showing: Duration,
+    shown: u32,
+    left_out: u64,
+    /// Events told.
+    told: usize,
     noticed: Option<Instant>,
     first_latency: u64,
     latency_us: Vec<f32>,
 }
 
-/// Shows steps to the recorder and to whoever looks.
+/// Sends steps to whoever looks.
 #[derive(Debug)]
-pub(super) struct Shown {
-    recorded: Option<ObservedSteps>,
-    steps: Rc<BlockOutbox>,
-    is_watched: Rc<Cell<bool>>,
-}
+struct Sender<'a>(&'a BlockOutbox);
 
-impl Observer for Shown {
+impl Observer for Sender<'_> {
     fn observe(&mut self, frames: &StepFrames<'_>) -> Result<(), TransportError> {
-        if self.is_watched.get() {
-            // A view that cannot keep up, or has no room, does without.
-            let _ = self.steps.send(frames.encoded_len(), |write| frames.encode(write));
-        }
-        self.recorded.as_mut().map_or(Ok(()), |recorded| recorded.observe(frames))
+        // A view that cannot keep up, or has no room, does without.
+        let _ = self.0.send(frames.encoded_len(), |write| frames.encode(write));
+        Ok(())
     }
 }
 
@@ -149,29 +174,71 @@ impl Viewing {
         let expected = vehicles * per_vehicle + 64 * scenario.network.zones.len() + 1024;
         let waiting = (WAITING_BYTES / expected).clamp(FEWEST_WAITING, MOST_WAITING);
         Ok(Viewing {
-            steps: Rc::new(space.create_blocks(SERVICE_VIEW, expected, (waiting, VIEWS), true)?),
+            steps: space.create_blocks(SERVICE_VIEW, expected, (waiting, VIEWS), true)?,
             notices: space.create_blocks(SERVICE_NOTICES, 4096, (16, VIEWS), true)?,
             steering: if patience.is_some() { Some(space.create_steering(SERVICE_STEERING)?) } else { None },
             left_at: Instant::now() + patience.unwrap_or_default(),
-            is_watched: Rc::default(),
-            is_recorded: false,
+            is_watched: false,
+            next_at: Instant::now(),
+            keeping: Duration::ZERO,
+            showing: Duration::ZERO,
+            shown: 0,
+            left_out: 0,
+            told: 0,
             noticed: None,
             first_latency: 0,
             latency_us: Vec::with_capacity(MOST_LATENCIES),
         })
     }
 
-    /// Whoever is to be shown all steps, besides those who look now and then.
-    pub fn show_to(&mut self, driver: &mut Driver, recorded: Option<ObservedSteps>) {
-        self.is_recorded = recorded.is_some();
-        let (steps, is_watched) = (self.steps.clone(), self.is_watched.clone());
-        driver.observe(Box::new(Shown { recorded, steps, is_watched }));
-        driver.show_steps(self.is_recorded);
+    /// The state of a step has been published, and others work on it: shows the step before, if it was kept and has not
+    /// been shown, and keeps this one if its turn has come, or somebody has asked for it.
+    pub fn overlap(&mut self, driver: &mut Driver, is_asked_for: bool) -> Result<(), ProcessError> {
+        if !self.is_watched {
+            return Ok(());
+        }
+        let is_last = driver.world().is_finished();
+        let begin = Instant::now();
+        if self.show(driver)? {
+            self.next_at = begin + (self.keeping + self.showing) * SHARE;
+        }
+        if begin >= self.next_at || is_asked_for || is_last {
+            driver.keep_step();
+            self.keeping = begin.elapsed();
+        } else {
+            self.left_out += 1;
+        }
+        if is_last {
+            self.show(driver)?;
+        }
+        Ok(())
+    }
+
+    /// No step is due for so long: shows the one before, where there is time enough.
+    pub fn idle(&mut self, driver: &mut Driver, left: Duration) -> Result<(), ProcessError> {
+        if self.is_watched && left > self.showing * 2 && self.show(driver)? {
+            // Nobody waited for it.
+            self.next_at = Instant::now() + self.keeping * SHARE;
+        }
+        Ok(())
+    }
+
+    fn show(&mut self, driver: &mut Driver) -> Result<bool, ProcessError> {
+        let begin = Instant::now();
+        let is_shown = driver.show_kept(&mut Sender(&self.steps)).map_err(LockstepError::from)?;
+        if is_shown {
+            self.showing = begin.elapsed();
+            self.shown = self.shown.wrapping_add(1);
+            if self.shown.is_multiple_of(ALL_IN_FORCE_EVERY) {
+                driver.show_all_in_force();
+            }
+        }
+        Ok(is_shown)
     }
 
     /// A step took so long.
     pub fn step_done(&mut self, step: u64, ns: u64) {
-        if self.is_watched.get() && self.latency_us.len() < MOST_LATENCIES {
+        if self.is_watched && self.latency_us.len() < MOST_LATENCIES {
             if self.latency_us.is_empty() {
                 self.first_latency = step;
             }
@@ -180,10 +247,18 @@ impl Viewing {
     }
 
     /// Sees whether somebody looks and steers, and tells how the run goes; called between two steps, now and then.
-    pub fn attend(&mut self, driver: &mut Driver, pacer: &mut Pacer) -> Result<(), ProcessError> {
+    pub fn attend(
+        &mut self,
+        driver: &mut Driver,
+        pacer: &mut Pacer,
+        events: &mut Events,
+    ) -> Result<(), ProcessError> {
         let is_watched = self.steps.has_reader();
-        if is_watched != self.is_watched.replace(is_watched) {
-            driver.show_steps(is_watched || self.is_recorded);
+        if is_watched != self.is_watched {
+            self.is_watched = is_watched;
+            driver.show_all_in_force();
+            (self.keeping, self.showing, self.next_at) = (Duration::ZERO, Duration::ZERO, Instant::now());
+            (self.left_out, self.told) = (0, 0);
             self.latency_us.clear();
             self.noticed = None;
         }
@@ -191,8 +266,11 @@ impl Viewing {
             let step = driver.world().step();
             while let Some(bytes) = steering.receive()? {
                 // What is none is nobody's of ours.
-                if let Ok(wish) = serde_json::from_slice(&bytes) {
-                    pacer.steer(wish, step);
+                if let Ok(wish) = serde_json::from_slice::<Steering>(&bytes)
+                    && pacer.steer(wish, step)
+                {
+                    trace::note(|| wish.to_string());
+                    events.say(step, RunEventKind::Steered, wish.to_string());
                     self.noticed = None;
                 }
             }
@@ -205,14 +283,15 @@ impl Viewing {
         }
         if is_watched && self.noticed.is_none_or(|at| at.elapsed() >= NOTICE_EVERY) {
             self.noticed = Some(Instant::now());
-            let notice = self.notice(driver, pacer);
+            let notice = self.notice(driver, pacer, events.since(self.told));
+            self.told += notice.events.len();
             let bytes = serde_json::to_vec(&notice).expect("a notice is numbers and text");
             let _ = self.notices.send(bytes.len(), |write| write(&bytes));
         }
         Ok(())
     }
 
-    fn notice(&mut self, driver: &Driver, pacer: &Pacer) -> Notice {
+    fn notice(&mut self, driver: &Driver, pacer: &Pacer, events: &[RunEvent]) -> Notice {
         let names = driver.names();
         let world = Place { name: "world".to_owned(), process_id: std::process::id(), generation: 0 };
         let others = driver.members().map(|member| Place {
@@ -232,7 +311,9 @@ impl Viewing {
             missed_steps: report.as_ref().map_or(0, |report| report.missed_steps),
             missed_by: report.map_or_else(Vec::new, |report| report.missed_by),
             refused: driver.refused().iter().map(ToString::to_string).collect(),
+            events: events.to_vec(),
             late_frames: driver.late_frames(),
+            left_out_steps: self.left_out,
             is_paused: pacer.is_paused(),
             pace: pacer.pace(),
             is_steered: self.steering.is_some(),
@@ -251,8 +332,22 @@ pub struct Watched {
 }
 
 impl Watched {
+    /// How nice whoever looks is to be to the processes of the run.
+    pub const NICENESS: i32 = 10;
+
+    /// Looks for a run and opens it, without entering it as long as it is not there, which would be in the way of
+    /// whoever begins it.
+    ///
+    /// # Errors
+    /// When shared memory cannot be read, or the run not opened.
+    pub fn find(run: &RunName) -> Result<Option<(Watched, Metadata, Arc<Scenario>)>, ProcessError> {
+        let is_there =
+            |other: &Leftover| other.condition == Condition::Alive && other.name == run.to_string();
+        if clean(true)?.iter().any(is_there) { Watched::open(run) } else { Ok(None) }
+    }
+
     /// Begins to look at a run; returns what it is as well. `None` while there is no such run that can be looked at.
-    pub fn open(run: &RunName) -> Result<Option<(Watched, Metadata, Arc<Scenario>)>, ProcessError> {
+    fn open(run: &RunName) -> Result<Option<(Watched, Metadata, Arc<Scenario>)>, ProcessError> {
         let space = RunSpace::enter(run)?;
         let Some(world) = space.world().filter(|world| super::peers::is_alive(*world)) else {
             return Ok(None);

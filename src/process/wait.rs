@@ -7,6 +7,7 @@ use super::{Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
 use crate::own_time::LONGEST_PAUSE;
 use crate::scenario::ControllerNames;
+use crate::trace::{self, Phase};
 use crate::transport::iox::{Bell, monotonic_ns};
 use ipc_schemas::{Role, WAITING_ADAPTIVE, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
 use std::io::Read;
@@ -338,7 +339,10 @@ impl Waiter {
             match driver.advance().map_err(|error| self.explain(error))? {
                 Progress::Finished => return Ok(()),
                 Progress::Advanced => self.reset(),
-                Progress::Waiting(awaited) => self.wait(awaited, None)?,
+                Progress::Waiting(awaited) => {
+                    trace::begin(Phase::Wait, awaited.step);
+                    self.wait(awaited, None)?;
+                }
                 Progress::Behind => {
                     if let Some(handover) = catch_up()? {
                         driver.take_over(handover);

@@ -3,7 +3,7 @@
 use super::attach::{Readiness, Reception};
 use super::house::House;
 use super::observe::{self, ObservedSteps};
-use super::outcome::{History, Outcome, StepMeter};
+use super::outcome::{Events, History, Outcome, StepMeter};
 use super::pace::Pacer;
 use super::peers::is_alive;
 use super::placement::number_of_cores;
@@ -16,6 +16,7 @@ use crate::own_time::Bound;
 use crate::record::{FileSource, Processes, Reader, ReplayError, replay_world};
 use crate::scenario::Scenario;
 use crate::step::StepFrames;
+use crate::trace::{self, Phase};
 use crate::transport::iox::{RunName, RunSpace, SpaceError};
 use crate::world::World;
 use ipc_schemas::Role;
@@ -172,7 +173,7 @@ pub fn run_world(
         false => None,
     };
     // What is shown is what is kept.
-    let mut viewing = match ledger {
+    let viewing = match ledger {
         Some(_) => {
             let sizes = (expected_vehicles(scenario), run_id);
             let processes = Processes { coordinators, controllers };
@@ -205,8 +206,8 @@ pub fn run_world(
     if missed {
         driver.go_on_after_miss();
     }
-    if let Some(viewing) = &mut viewing {
-        viewing.show_to(&mut driver, observed);
+    if let Some(observed) = observed {
+        driver.observe(Box::new(observed));
     }
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
     let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
@@ -221,6 +222,7 @@ pub fn run_world(
         replace: options.replace,
         pacer: Pacer::new(options.timing, scenario.dt_ns),
         viewing,
+        events: Events::default(),
         overdue: None,
         gone: None,
         arrived: Vec::new(),
@@ -234,7 +236,8 @@ pub fn run_world(
     let mut meter = StepMeter::start();
     let mut step = first_step;
     loop {
-        if driver.is_between_steps() {
+        let publishes = driver.is_between_steps();
+        if publishes {
             house.begin_step(&mut driver, &mut waiter, stop)?;
             meter.begin_step(house.pacer.is_scheduled());
         }
@@ -243,26 +246,34 @@ pub fn run_world(
                 history.punctuality = house.pacer.report(&driver.names());
                 history.refused = driver.refused();
                 history.late_frames = driver.late_frames();
+                history.events = house.events.take();
                 let outcome = meter.outcome(driver.world(), history);
                 let patience = options.peer_timeout;
                 let departure = Departure { driver, patience, _services: services, _space: space };
                 return Ok((outcome, departure));
             }
-            Progress::Waiting(awaited) => house.wait(&mut driver, &mut waiter, awaited)?,
+            Progress::Waiting(awaited) => {
+                trace::enter(Phase::Wait);
+                house.wait(&mut driver, &mut waiter, awaited)?;
+            }
             Progress::Behind => unreachable!("the world is where the run is"),
             Progress::Advanced => waiter.reset(),
+        }
+        if publishes {
+            house.overlap_views(&mut driver)?;
         }
         if driver.world().step() == step {
             continue;
         }
         step = driver.world().step();
+        trace::begin(Phase::Compute, step);
         waiter.reset();
         house.overdue = None;
         let ns = meter.step_done(driver.was_event());
         if let Some(viewing) = &mut house.viewing {
             viewing.step_done(step - 1, ns);
         }
-        history.replacements.extend(house.step_done(ns));
+        history.replacements.extend(house.step_done(&driver, ns));
         if house.pacer.is_scheduled() || step.is_multiple_of(STEPS_PER_LOOK) {
             progress(driver.world());
             house.attend(&mut driver, &mut waiter)?;

@@ -284,6 +284,34 @@ pub struct Footer {
     pub missing: Vec<(u64, u64)>,
     /// The last block's link.
     pub link: [u8; 16],
+    /// What happened to the run beside its steps, as far as it came to its end; none in older recordings.
+    #[serde(default)]
+    pub events: Vec<RunEvent>,
+}
+
+/// Something that happened to a run, beside its steps.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct RunEvent {
+    /// The step that was under way, or was next.
+    pub step: u64,
+    /// What.
+    pub kind: RunEventKind,
+    /// In words.
+    pub text: String,
+}
+
+/// What happens to runs.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RunEventKind {
+    /// Somebody begins not to answer by the deadline.
+    Missed,
+    /// The first frames of a sender were refused.
+    Refused,
+    /// A process took another's place.
+    Replaced,
+    /// Somebody steered the run.
+    Steered,
 }
 
 /// How a recorded run ended.

@@ -20,7 +20,7 @@ pub use crate::step::{CommandPart, Commands, Step, StepFrames};
 pub use block::BlockFault;
 pub use compare::{Comparison, Difference, Section, compare};
 pub use file::is_growing;
-pub use format::{Build, Footer, Metadata, Processes, RunEnd, ScenarioSource};
+pub use format::{Build, Footer, Metadata, Processes, RunEnd, RunEvent, RunEventKind, ScenarioSource};
 pub use owed::{Condition, InForce, Owed};
 pub use reader::{Builds, Damage, FileSource, Flaw, OpenError, Reader, Source, Steps};
 pub use recorder::{Output, QueueLimits, RecordError, Recorded, Recorder, steps_in};

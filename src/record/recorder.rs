@@ -6,7 +6,7 @@
 //! Nothing is made before there is a step to write (`file`).
 
 use super::file::{RecordingFile, probe};
-use super::format::{Metadata, RunEnd};
+use super::format::{Metadata, RunEnd, RunEvent};
 use super::writer::{WriteError, Writer};
 use crate::step::{Step, StepFrames};
 use crossbeam::channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
@@ -118,7 +118,7 @@ pub fn steps_in(ranges: &[(u64, u64)]) -> u64 {
 
 enum Message {
     Block(Vec<u8>),
-    End(RunEnd, Vec<(u64, u64)>),
+    End(RunEnd, Vec<(u64, u64)>, Vec<RunEvent>),
 }
 
 /// Takes steps, and waits only where it is asked to.
@@ -136,6 +136,7 @@ pub struct Recorder {
     next: u64,
     /// Steps that could not be let in so far, and those that were never pushed between two that were.
     missing: Vec<(u64, u64)>,
+    events: Vec<RunEvent>,
 }
 
 impl Recorder {
@@ -163,7 +164,17 @@ impl Recorder {
         let waiting_bytes = Arc::new(AtomicUsize::new(0));
         let waiting = waiting_bytes.clone();
         let thread = Some(std::thread::spawn(move || write(open, &metadata, &inbox, &done, &waiting)));
-        Recorder { queue, spares, spare: None, waiting_bytes, limits, thread, next: 0, missing: Vec::new() }
+        Recorder {
+            queue,
+            spares,
+            spare: None,
+            waiting_bytes,
+            limits,
+            thread,
+            next: 0,
+            missing: Vec::new(),
+            events: Vec::new(),
+        }
     }
 
     /// Records a step, and waits while the queue is full: for runs that keep no clock, which come out the same
@@ -221,11 +232,16 @@ impl Recorder {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)
     }
 
+    /// What happened to the run beside its steps; its end says so.
+    pub fn happened(&mut self, events: Vec<RunEvent>) {
+        self.events = events;
+    }
+
     /// Writes what waits, then the end. Waits for the disk. Of a failure that has been told, nothing is said
     /// again.
     pub fn finish(self, end: RunEnd) -> Result<Recorded, RecordError> {
         // When the thread has failed nobody takes this; it says why below.
-        let _ = self.queue.send(Message::End(end, self.missing));
+        let _ = self.queue.send(Message::End(end, self.missing, self.events));
         drop(self.queue);
         match self.thread {
             Some(thread) => thread.join().expect("the recorder's thread returns its errors"),
@@ -295,7 +311,7 @@ fn write<W: Output>(
     let mut message = match inbox.recv() {
         Ok(message @ Message::Block(_)) => Ok(message),
         // Nothing happened, so nothing is made.
-        Ok(Message::End(_, missing)) => return Ok(Recorded { steps: 0, bytes: 0, missing }),
+        Ok(Message::End(_, missing, _)) => return Ok(Recorded { steps: 0, bytes: 0, missing }),
         Err(_) => return Ok(Recorded { steps: 0, bytes: 0, missing: Vec::new() }),
     };
     let begin = || Writer::new(BufWriter::with_capacity(BUFFER, open()?), metadata);
@@ -309,7 +325,10 @@ fn write<W: Output>(
                 let _ = done.try_send(block);
                 appended.map_err(|source| failed(writer.steps(), source))?;
             }
-            Ok(Message::End(end, missing)) => return close(writer, end, missing),
+            Ok(Message::End(end, missing, events)) => {
+                writer.happened(events);
+                return close(writer, end, missing);
+            }
             Err(RecvTimeoutError::Timeout) => {}
             // Whoever recorded is gone without a word: the file ends as if it had been killed.
             Err(RecvTimeoutError::Disconnected) => return abandon(writer),

@@ -1,7 +1,9 @@
 //! A recording as a stream of bytes: head, sealed blocks, end.
 
 use super::block::{BlockFault, BlockHead};
-use super::format::{Digest, EndHead, Entry, FileHead, Footer, Metadata, RunEnd, Seal, Tail, digest, padded};
+use super::format::{
+    Digest, EndHead, Entry, FileHead, Footer, Metadata, RunEnd, RunEvent, Seal, Tail, digest, padded,
+};
 use std::io::{self, Write};
 use zerocopy::IntoBytes;
 
@@ -13,6 +15,7 @@ pub struct Writer<W> {
     link: Digest,
     index: Vec<Entry>,
     state_hash: u64,
+    events: Vec<RunEvent>,
 }
 
 /// Why a block was not written.
@@ -42,7 +45,7 @@ impl<W: Write> Writer<W> {
         out.write_all(head.as_bytes())?;
         out.write_all(&metadata)?;
         let offset = (size_of::<FileHead>() + metadata.len()) as u64;
-        Ok(Writer { out, offset, link: head.digest, index: Vec::new(), state_hash: 0 })
+        Ok(Writer { out, offset, link: head.digest, index: Vec::new(), state_hash: 0, events: Vec::new() })
     }
 
     /// Appends a step's block and seals it.
@@ -90,10 +93,16 @@ impl<W: Write> Writer<W> {
         self.offset
     }
 
+    /// What happened to the run beside its steps, for its end.
+    pub fn happened(&mut self, events: Vec<RunEvent>) {
+        self.events = events;
+    }
+
     /// Ends the recording: index, footer, tail. Returns the number of bytes of it all as well.
     pub fn finish(mut self, end: RunEnd, missing: Vec<(u64, u64)>) -> io::Result<(W, Footer, u64)> {
         let steps = self.steps();
-        let footer = Footer { steps, state_hash: self.state_hash, end, missing, link: self.link };
+        let events = std::mem::take(&mut self.events);
+        let footer = Footer { steps, state_hash: self.state_hash, end, missing, link: self.link, events };
         let bytes = padded(&footer);
         let head = EndHead::new(self.index.len(), bytes.len());
         let seal = digest(&[head.as_bytes(), self.index.as_bytes(), &bytes]);

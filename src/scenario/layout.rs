@@ -45,7 +45,7 @@ pub struct OnLane {
 pub struct Layout {
     shapes: Shapes,
     /// By link: from the end of the exit's lane to the entrance it leads to, with its length, m.
-    links: Vec<([Place; 2], f64)>,
+    links: Vec<(Vec<Place>, f64)>,
     /// By zone and path: segments with their lengths, m.
     paths: Vec<Vec<Vec<(u32, f64)>>>,
 }
@@ -118,7 +118,7 @@ impl Layout {
         if state.zone != NO_ZONE {
             return self.on_path(state.zone, state.path, state.x_m);
         }
-        let (_, length_m) = *self.links.get(state.link as usize)?;
+        let length_m = self.links.get(state.link as usize)?.1;
         Some(OnLane { lane: Lane::Link(state.link), at_m: state.x_m.clamp(0.0, length_m), length_m })
     }
 

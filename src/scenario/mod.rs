@@ -3,6 +3,7 @@
 //! A [`Scenario`] is validated: every value in it is finite and within its stated range, every index
 //! points at something, and every zone has a way out of the network. Nothing downstream checks these again.
 
+mod arrange;
 pub mod arrivals;
 mod check;
 pub mod circles;

@@ -1,5 +1,6 @@
 //! Where lanes lie in the plane: as the scenario says, or laid out where it does not.
 
+use super::arrange::{ROWS_APART_M, arrange};
 use super::{Network, Source, Zone, ZoneId};
 
 /// A place in the plane, m.
@@ -18,7 +19,7 @@ pub struct Shapes(Vec<Vec<Vec<Place>>>);
 
 impl Shapes {
     /// The shapes a network's scenario says, or else lanes from left to right, zones one behind the other and side by
-    /// side where they do not lie on one way.
+    /// side where they do not lie on one way; in rows, where they would be much wider or higher than a page.
     pub fn of(network: &Network) -> Shapes {
         let mut shapes = Shapes(Vec::with_capacity(network.zones.len()));
         let mut free_m = 0.0;
@@ -44,6 +45,7 @@ impl Shapes {
             let placed = (0..zone.segments.len()).map(|at| place(zone, at, origin, aside_m(at)));
             shapes.0.push(placed.collect());
         }
+        arrange(network, &mut shapes.0);
         shapes
     }
 
@@ -60,10 +62,19 @@ impl Shapes {
         shape[shape.len() - 1]
     }
 
-    /// From an exit to the entrance it leads to; `None` where it leads out of the network.
-    pub fn link(&self, network: &Network, zone: ZoneId, exit: u32) -> Option<[Place; 2]> {
+    /// From an exit to the entrance it leads to, at least two places; `None` where it leads out of the network.
+    pub fn link(&self, network: &Network, zone: ZoneId, exit: u32) -> Option<Vec<Place>> {
         let to = network.zones[zone as usize].exits[exit as usize].to?;
-        Some([self.exit(network, zone, exit), self.segments(to.zone)[to.segment as usize][0]])
+        let (from, end) = (self.exit(network, zone, exit), self.segments(to.zone)[to.segment as usize][0]);
+        let is_shaped =
+            |zone: ZoneId| network.zones[zone as usize].segments.iter().any(|s| !s.shape.is_empty());
+        if end.0 >= from.0 || is_shaped(zone) || is_shaped(to.zone) {
+            return Some(vec![from, end]);
+        }
+        // Back to the beginning of the next row, between the two.
+        let (aside_m, between_m) = (0.3 * APART_M, end.1 + 0.5 * ROWS_APART_M);
+        let (right, left) = (from.0 + aside_m, end.0 - aside_m);
+        Some(vec![from, (right, from.1), (right, between_m), (left, between_m), (left, end.1), end])
     }
 
     /// The place so far along a path, m.
@@ -133,10 +144,37 @@ mod tests {
         let (network, shapes) = (&scenario.network, Shapes::of(&scenario.network));
         let ends: Vec<Place> = shapes.segments(0).iter().map(|lane| lane[lane.len() - 1]).collect();
         assert_eq!(ends[0], ends[1]);
-        let [from, to] = shapes.link(network, 0, 0).unwrap();
+        let [from, to] = shapes.link(network, 0, 0).unwrap()[..] else { panic!("no straight link") };
         assert_eq!(from, ends[0]);
         assert_eq!(to, from, "no link lies between them");
         assert_eq!(shapes.on_path(network, 0, 0, 0.0), (0.0, 0.0));
         assert_eq!(shapes.link(network, 1, 0), None);
+    }
+
+    /// Width and height of what is laid out, and whether no two zones lie on each other.
+    fn extent(network: &Network) -> (f64, f64) {
+        let shapes = Shapes::of(network);
+        let all: Vec<Place> = shapes.0.iter().flatten().flatten().copied().collect();
+        let span = |of: fn(&Place) -> f64| {
+            let values = || all.iter().map(of);
+            values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
+        };
+        let middle = |zone: &Vec<Vec<Place>>| (zone[0][0], zone[0][zone[0].len() - 1]);
+        let mut middles: Vec<_> = shapes.0.iter().map(middle).collect();
+        middles.sort_by(|a, b| a.partial_cmp(b).unwrap());
+        assert!(middles.windows(2).all(|pair| pair[0] != pair[1]), "two zones lie on each other");
+        (span(|p| p.0), span(|p| p.1))
+    }
+
+    #[test]
+    fn what_would_be_a_long_row_or_a_high_column_is_laid_out_in_rows() {
+        let none: [Override; 0] = [];
+        let (width, height) = extent(&load_embedded("corridor-8", &none, None).unwrap().network);
+        assert!((0.7..4.0).contains(&(width / height)), "{width} m by {height} m");
+        for vehicles in [100, 1_000, 10_000] {
+            let many = crate::bench::side_by_side(crate::bench::Family::Corridors, vehicles, 90.0).unwrap();
+            let (width, height) = extent(&many.network);
+            assert!((0.7..3.2).contains(&(width / height)), "{vehicles}: {width} m by {height} m");
+        }
     }
 }

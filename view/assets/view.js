@@ -5,8 +5,11 @@ const HEAD = 8, WORDS = 9, NONE = 0xffffffff, COMMANDED = 0x80;
 const MODES = ["entered", "FE", "OCBF"];
 const VERDICTS = ["as wished", "FE", "bound", "infeasible", "held", "held by shield"];
 const EVENTS = { infeasible: "--v-3", missed: "--m-other", replaced: "--accent", refused: "--v-5", skipped: "--quiet", steered: "--good" };
-// Warm is slow, cool is fast: told apart with any kind of colour vision.
-const RAMP = [[150, 30, 0], [224, 96, 10], [244, 180, 10], [48, 170, 160], [28, 116, 204], [24, 60, 150]];
+// Warm is slow, cool is fast: told apart with any kind of colour vision, and from what is behind.
+const RAMPS = {
+  light: [[150, 30, 0], [224, 96, 10], [244, 180, 10], [48, 170, 160], [28, 116, 204], [24, 60, 150]],
+  dark: [[255, 84, 52], [255, 146, 46], [250, 208, 84], [84, 204, 186], [82, 172, 252], [168, 212, 255]],
+};
 const BINS = 24;
 
 const $ = id => document.getElementById(id);
@@ -64,6 +67,8 @@ class Frame {
   }
 }
 
+// Missing steps that are passed over at most.
+const GAP = 200;
 const CACHE_BYTES = 192 * 2 ** 20;
 
 // The steps of one run, fetched when they are wanted.
@@ -89,6 +94,15 @@ class Frames {
       from += count;
     }
   }
+  // The steps before and after an instant that are there: of a run that leaves some out, not the next ones.
+  around(step) {
+    let before = step, after = step + 1;
+    while (before > step - GAP && this.absent.has(before)) before--;
+    while (after < step + GAP && this.absent.has(after)) after++;
+    if (before < step && !this.known.has(before)) this.want(before - 20, 20);
+    if (after > step + 1 && !this.known.has(after)) this.want(after, 1);
+    return [this.get(before), this.get(after)];
+  }
   async fetch(from, count) {
     this.busy++;
     for (let i = 0; i < count; i++) this.asked.add(from + i);
@@ -104,7 +118,7 @@ class Frames {
         offset += frame.bytes;
       }
       const end = got.size ? Math.max(...got) : from + count - 1;
-      if (this.run.status.live?.is_over !== false) for (let i = from; i < Math.min(from + count, end); i++) if (!got.has(i)) this.absent.add(i);
+      for (let i = from; i < Math.min(from + count, end); i++) if (!got.has(i)) this.absent.add(i);
       for (const [step, frame] of this.known) {
         if (this.bytes <= CACHE_BYTES) break;
         this.known.delete(step);
@@ -176,6 +190,7 @@ class Geometry {
       return { path, left: Math.min(...xs), right: Math.max(...xs), bottom: Math.min(...ys), top: Math.max(...ys) };
     });
     for (const link of network.links) trace(this.between, link.shape);
+    for (const join of network.joins) trace(this.between, join);
     this.low = low;
     this.high = high;
     this.middles = network.zones.map(zone => {
@@ -289,17 +304,19 @@ async function zonesOf(run, step) {
 /* ---------------------------------------------------------------- colours */
 
 function ramp(t) {
+  const RAMP = RAMPS[document.documentElement.dataset.theme] ?? RAMPS.light;
   const x = clamp(t, 0, 1) * (RAMP.length - 1), i = Math.min(RAMP.length - 2, Math.floor(x)), f = x - i;
   return RAMP[i].map((c, k) => Math.round(c + f * (RAMP[i + 1][k] - c)));
 }
 const rgb = c => `rgb(${c[0]} ${c[1]} ${c[2]})`;
-const RAMP_CSS = Array.from({ length: BINS }, (_, i) => rgb(ramp(i / (BINS - 1))));
+let RAMP_CSS = [];
 
 function readTheme() {
   const names = ["back", "pane", "ink", "quiet", "line", "lane", "lane-mark", "accent", "good", "bad", "grid", "ghost", "outline",
     "m-entered", "m-fe", "m-ocbf", "m-other", "v-0", "v-1", "v-2", "v-3", "v-4", "v-5"];
   state.theme = Object.fromEntries(names.map(name => [name, css(`--${name}`)]));
   const t = state.theme;
+  RAMP_CSS = Array.from({ length: BINS }, (_, i) => rgb(ramp(i / (BINS - 1))));
   state.palettes = {
     speed: RAMP_CSS,
     mode: [t["m-entered"], t["m-fe"], t["m-ocbf"], t["m-other"]],
@@ -417,6 +434,13 @@ class CzMap {
     context.setTransform(ratio * v.scale, 0, 0, -ratio * v.scale, ratio * (this.width / 2 - v.x * v.scale), ratio * (this.height / 2 + v.y * v.scale));
     context.lineCap = context.lineJoin = "round";
     const lane = Math.max(3.4, (run.network.zones.length > 200 ? 2 : 6.5) / v.scale);
+    if (zone !== null) {
+      context.strokeStyle = t.accent;
+      context.globalAlpha = 0.45;
+      context.lineWidth = lane + 9 / v.scale;
+      context.stroke(run.geometry.lanes[zone].path);
+      context.globalAlpha = 1;
+    }
     context.strokeStyle = t.lane;
     context.lineWidth = lane;
     context.setLineDash([3 * lane, 2 * lane]);
@@ -431,7 +455,6 @@ class CzMap {
     context.restore();
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     if (v.scale > 2) this.drawArrows(context);
-    if (zone !== null) this.markZone(context);
     this.drawPoints(context);
     this.drawNames(context);
     return this.ground;
@@ -459,20 +482,6 @@ class CzMap {
     }
     context.stroke();
   }
-  markZone(context) {
-    const zone = run_zone(this.run, state.zone), v = state.view;
-    context.save();
-    context.strokeStyle = state.theme.accent;
-    context.globalAlpha = 0.35;
-    context.lineWidth = Math.max(3.6 * v.scale, 5) + 5;
-    context.lineCap = context.lineJoin = "round";
-    for (const { shape } of zone.segments) {
-      context.beginPath();
-      shape.forEach((p, i) => { const [x, y] = this.px(...p); if (i) context.lineTo(x, y); else context.moveTo(x, y); });
-      context.stroke();
-    }
-    context.restore();
-  }
   drawPoints(context) {
     const v = state.view, t = state.theme, size = clamp(1.1 * v.scale, 2.2, 6);
     if (this.run.network.zones.length > 200 && v.scale < 0.5) return;
@@ -488,7 +497,7 @@ class CzMap {
       context.fill();
       context.strokeStyle = t.quiet;
       context.stroke();
-      if (v.scale > 5) { context.fillStyle = t.quiet; context.font = "11px system-ui, 'DejaVu Sans', sans-serif"; context.textAlign = "left"; context.fillText(point.name, x + size + 3, y - size); }
+      if (v.scale > 5) { context.fillStyle = t.quiet; context.font = "11px system-ui, 'DejaVu Sans', sans-serif"; context.textAlign = "left"; written(context, point.name, x + size + 3, y - size); context.lineWidth = 1.3; }
     }
   }
   drawNames(context) {
@@ -502,9 +511,14 @@ class CzMap {
       for (const zone of zones) for (const segment of zone.segments) {
         if (segment.road) this.label(context, segment.road, segment.shape[0], segment.shape[1]);
       }
-      for (const zone of zones) for (const exit of zone.exits) {
-        if (exit.to === null) this.label(context, exit.name, exit.place, exit.place);
-      }
+      // Where exits crowd around the middle of a zone their names would hide it.
+      zones.forEach((zone, i) => {
+        const [mx, my] = this.px(...this.run.geometry.middles[i]);
+        for (const exit of zone.exits) {
+          const [x, y] = this.px(...exit.place);
+          if (exit.to === null && Math.hypot(x - mx, y - my) > 70) this.label(context, exit.name, exit.place, exit.place);
+        }
+      });
     }
     context.font = "600 12px system-ui, 'DejaVu Sans', sans-serif";
     if (zones.length > 1) zones.forEach((zone, i) => this.label(context, zone.name, this.run.geometry.middles[i], null));
@@ -512,7 +526,8 @@ class CzMap {
   // A name beside a place, pushed outward along the lane, unless another is there already.
   label(context, text, place, onward) {
     const [x, y] = this.px(...place), half = context.measureText(text).width / 2 + 4;
-    let [dx, dy] = [0, -1];
+    // Below a lane that lies flat: numbers of vehicles are above.
+    let [dx, dy] = [0, onward ? 1 : -1];
     if (onward && onward !== place) {
       const [ox, oy] = this.px(...onward), d = Math.hypot(ox - x, oy - y) || 1;
       if (Math.abs(oy - y) > Math.abs(ox - x)) [dx, dy] = [(x - ox) / d, (y - oy) / d];
@@ -521,12 +536,13 @@ class CzMap {
     const isOut = x < -20 || y < -20 || x > this.width + 20 || y > this.height + 20;
     if (isOut || this.taken.some(([tx, ty, th]) => Math.abs(tx - lx) < th + half && Math.abs(ty - ly) < 14)) return;
     this.taken.push([lx, ly, half]);
-    context.fillText(text, lx, ly);
+    written(context, text, lx, ly);
   }
   drawVehicles(context) {
-    const frame = this.frame, next = this.next, { run } = this, v = state.view, share = state.time - now();
+    const frame = this.frame, next = this.next, { run } = this, v = state.view;
     this.shown.length = 0;
     if (!frame) return;
+    const since = Math.max(0, state.time - frame.step), share = next ? Math.min(1, since / (next.step - frame.step)) : Math.min(1, since);
     // They get names of their own.
     const partners = new Set(state.run === run.index ? state.detail?.duties?.map(duty => duty.partner) ?? [] : []);
     const palette = state.palettes[state.colour], bins = palette.map(() => []), front = [0, 0], rear = [0, 0];
@@ -546,7 +562,7 @@ class CzMap {
         if (to >= 0 && next.u32[to + 1] === zone && next.u32[to + 2] === path) {
           x += share * (next.f32[to + 3] - x);
           speed += share * (next.f32[to + 4] - speed);
-        } else x += share * dtS * speed;
+        } else x += share * (next ? next.step - frame.step : 1) * dtS * speed;
       }
       course.locate(x, front);
       if (front[0] < left || front[0] > right || front[1] > top || front[1] < bottom) continue;
@@ -569,7 +585,7 @@ class CzMap {
       if (!corners.length) return;
       context.fillStyle = palette[i];
       if (areDots) {
-        for (let k = 0; k < corners.length; k += 8) context.fillRect(Math.round(corners[k + 4]) - 2, Math.round(corners[k + 5]) - 2, 4, 4);
+        for (let k = 0; k < corners.length; k += 8) context.fillRect(Math.round((corners[k] + corners[k + 4]) / 2) - 2, Math.round((corners[k + 1] + corners[k + 5]) / 2) - 2, 4, 4);
         return;
       }
       context.beginPath();
@@ -597,7 +613,7 @@ class CzMap {
       context.font = "10px system-ui, 'DejaVu Sans', sans-serif";
       context.textAlign = "center";
       context.fillStyle = state.theme.quiet;
-      for (let k = 0; k < labels.length; k += 4) context.fillText(labels[k], labels[k + 1], labels[k + 2] - labels[k + 3] - 5);
+      for (let k = 0; k < labels.length; k += 4) written(context, labels[k], labels[k + 1], labels[k + 2] - labels[k + 3] - 5);
     }
   }
   placeOf(vehicle) {
@@ -663,6 +679,14 @@ class CzMap {
     context.fillStyle = colour;
     context.fillText(text, x, y + radius + 13);
   }
+}
+// Text that can be read on anything.
+function written(context, text, x, y) {
+  context.lineWidth = 3;
+  context.lineJoin = "round";
+  context.strokeStyle = state.theme.pane;
+  context.strokeText(text, x, y);
+  context.fillText(text, x, y);
 }
 const run_zone = (run, zone) => run.network.zones[zone];
 
@@ -773,8 +797,11 @@ function showOverview(box, d) {
   const rows = d.zones.filter(Boolean).map(zone => el("tr", { "data-zone": zone.zone, onclick: () => select({ zone: zone.zone }) },
     el("td", {}, zone.name), el("td", { class: "num" }, String(zone.n)), el("td", { class: "num" }, speeds(zone.exits))));
   const more = run.network.zones.length - d.zones.length;
+  const differs = state.runs[1]?.status.differs_at;
   fill(box,
     el("div", { class: "head" }, el("h2", {}, run.scenario), el("span", { class: "quiet" }, `seed ${run.seed}`)),
+    state.runs.length < 2 ? null : el("p", { "data-field": "differs" }, differs === null || differs === undefined ? "The states of both are the same." :
+      el("button", { onclick: () => goto(differs), title: "Go there" }, `the same before ${fixed(differs * run.dt_s, 1)} s, step ${differs}`)),
     el("table", { class: "facts" },
       fact("vehicles", "present", `${frame ? frame.count : 0} now, ${status.vehicles} so far`),
       fact("step", "dt", `${run.dt_s} s`),
@@ -782,7 +809,7 @@ function showOverview(box, d) {
       run.overrides.length ? fact("changed", "overrides", run.overrides.join(" ")) : null,
       fact("state hash", "hash", frame ? frame.hash : "–"),
       fact("written by", "build", run.build),
-      status.skipped ? fact("not seen", "skipped", el("span", { class: "bad" }, `${status.skipped} steps`)) : null),
+      status.skipped ? fact("not seen", "skipped", el("span", { class: "bad" }, `${status.skipped} steps`), status.live?.left_out_steps ? `; ${status.live.left_out_steps} the run left out to lose no time` : null) : null),
     el("h3", {}, "Zones"),
     el("table", { class: "rows" }, el("tr", {}, el("th", {}, "zone"), el("th", { class: "num" }, "N"), el("th", { class: "num" }, "v_m [m/s]")), ...rows),
     more > 0 ? el("p", { class: "quiet" }, `and ${more} more; click one on the map`) : null,
@@ -1108,9 +1135,9 @@ function tick(at) {
     if (status.first === null || status.first === undefined) continue;
     const own = clamp(step, status.first, status.last);
     steps.want(own, ahead);
-    const frame = steps.get(own) ?? (steps.absent.has(own) ? map.frame : null);
+    const [before, after] = steps.around(own), frame = before ?? (steps.absent.has(own) ? map.frame : null);
     map.waits = !frame;
-    const next = own === step ? steps.get(own + 1) : null;
+    const next = own === step ? after : null;
     if (frame && (frame !== map.frame || next !== map.next)) { map.frame = frame; map.next = next; state.dirty = true; }
   }
   if (state.keeps) keep();

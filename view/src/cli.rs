@@ -4,6 +4,7 @@ use crate::live::watch;
 use crate::run::Run;
 use crate::server::Server;
 use clap::Parser;
+use control_zones::process::Watched;
 use control_zones::transport::iox::RunName;
 use std::ffi::OsString;
 use std::io::Read;
@@ -129,5 +130,7 @@ fn serve(runs: Vec<Arc<Run>>, port: u16) -> Result<(), String> {
     let failed = |error: std::io::Error| format!("--port {port}: cannot serve on it: {error}");
     let server = Server::new(runs, port).map_err(failed)?;
     println!("{}", server.address().map_err(failed)?);
+    // Threads begun from here on let the processes of the run go first.
+    let _ = rustix::process::nice(Watched::NICENESS);
     server.serve().map_err(failed)
 }

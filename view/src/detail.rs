@@ -18,11 +18,14 @@ const PLAN_POINTS: u32 = 40;
 const TRACES_SENT: usize = 150_000;
 
 impl Run {
+    /// A step, or the last before it where it is missing between others.
     fn step(&self, number: u64) -> Result<Step, String> {
         let there = || match self.steps.range() {
             Some((first, last)) => format!("there are steps {first} to {last}"),
             None => "there are none yet".to_owned(),
         };
+        let is_between = self.steps.range().is_some_and(|(first, last)| (first..=last).contains(&number));
+        let number = self.steps.last_until(number).filter(|_| is_between).unwrap_or(number);
         self.steps.step(number)?.ok_or_else(|| format!("step {number} is not there; {}", there()))
     }
 

@@ -1,7 +1,7 @@
 //! What is known of a run besides its steps: gathered in one pass over a recording, or step by step while it goes on.
 
 use control_zones::conflict::DutyKind;
-use control_zones::record::InForce;
+use control_zones::record::{InForce, RunEvent, RunEventKind};
 use control_zones::scenario::Scenario;
 use control_zones::step::Step;
 use ipc_schemas::{NO_ZONE, VERDICT_INFEASIBLE};
@@ -21,6 +21,8 @@ pub struct Line {
     pub least: [(f32, u32); 3],
     /// Controllers that did not answer in time, one bit each.
     pub misses: u64,
+    /// The world's state hash, in which all states before are.
+    pub state_hash: u64,
 }
 
 /// What an event on the time line is.
@@ -73,6 +75,8 @@ pub struct Trace {
 
 /// Most traces kept; beyond, every other step of them is left out.
 const MOST_TRACES: usize = 4_000_000;
+/// Steps in which none is missing that end a stretch in which some are.
+const STRETCH: u64 = 100;
 /// Most events kept.
 const MOST_EVENTS: usize = 5_000;
 
@@ -97,6 +101,8 @@ pub struct Index {
     pub is_complete: bool,
     /// Steps that came too fast to be taken.
     pub skipped: u64,
+    /// The event of the present stretch of missing steps (its step), the step after it, and how many are missing.
+    skipping: Option<(u64, u64, u64)>,
     in_force: InForce,
     infeasible: BTreeSet<u32>,
     missed: u64,
@@ -117,6 +123,7 @@ impl Index {
             stride: 1,
             is_complete: false,
             skipped: 0,
+            skipping: None,
             in_force: InForce::default(),
             infeasible: BTreeSet::new(),
             missed: 0,
@@ -131,13 +138,7 @@ impl Index {
             Some(last) if last.step >= number => return,
             Some(last) if last.step + 1 < number => {
                 let missing = number - last.step - 1;
-                self.skipped += missing;
-                self.say(
-                    number,
-                    EventKind::Skipped,
-                    format!("{missing} steps before this one are missing"),
-                    None,
-                );
+                self.skip(last.step, number, missing);
             }
             _ => {}
         }
@@ -148,6 +149,7 @@ impl Index {
             verdicts: [0; 6],
             least: [(f32::INFINITY, u32::MAX); 3],
             misses: step.misses,
+            state_hash: step.state_hash,
         };
         for state in step.state.iter().filter(|s| !s.has_left()) {
             line.vehicles += 1;
@@ -226,16 +228,61 @@ impl Index {
             self.generations = step.commands.iter().map(|part| part.generation).collect();
         }
         let now = self.generations.clone();
-        for (controller, (before, now)) in before.iter().zip(&now).enumerate().filter(|(_, (b, n))| b != n) {
-            let text = format!("controller {controller} was replaced: generation {now} after {before}");
+        for (controller, (_, now)) in before.iter().zip(&now).enumerate().filter(|(_, (b, n))| b != n) {
+            let text = format!("controller {controller} was replaced: generation {now}");
             self.say(number, EventKind::Replaced, text, None);
         }
     }
 
+    /// Notes that steps are missing: one event for a stretch of steps of which only some came.
+    fn skip(&mut self, before: u64, number: u64, missing: u64) {
+        self.skipped += missing;
+        let words = |first: u64, missing: u64| match missing {
+            1 => format!("step {first} is missing"),
+            _ => format!("{missing} of the steps {first} to {} are missing", number - 1),
+        };
+        let stretch = self.skipping.filter(|(_, end, _)| number - end <= STRETCH + missing);
+        let (first, missing) =
+            stretch.map_or((before + 1, missing), |(first, _, missed)| (first, missed + missing));
+        self.skipping = Some((first, number, missing));
+        let text = words(first, missing);
+        let known = |event: &&mut Event| (event.step, event.kind) == (first, EventKind::Skipped);
+        match self.events.iter_mut().rev().find(known) {
+            Some(event) => event.text = text,
+            None => self.say(first, EventKind::Skipped, text, None),
+        }
+    }
+
+    /// Notes what the world, or the end of a recording, says has happened; what has been seen in a step is known.
+    pub fn take_events(&mut self, events: &[RunEvent]) {
+        for RunEvent { step, kind, text } in events {
+            let kind = match kind {
+                RunEventKind::Missed => EventKind::Missed,
+                RunEventKind::Refused => EventKind::Refused,
+                RunEventKind::Replaced => EventKind::Replaced,
+                RunEventKind::Steered => EventKind::Steered,
+            };
+            let is_known = |other: &Event| {
+                (other.step, other.kind) == (*step, kind)
+                    && (other.text == *text || kind == EventKind::Missed)
+            };
+            let at = self.events.partition_point(|other| other.step <= *step);
+            let first = self.events.partition_point(|other| other.step < *step);
+            if !self.events[first..at].iter().any(is_known) {
+                self.put(at, Event { step: *step, kind, text: text.clone(), vehicle: None });
+            }
+        }
+    }
+
     /// Notes an event.
-    pub fn say(&mut self, step: u64, kind: EventKind, text: String, vehicle: Option<u32>) {
+    fn say(&mut self, step: u64, kind: EventKind, text: String, vehicle: Option<u32>) {
+        let at = self.events.partition_point(|other| other.step <= step);
+        self.put(at, Event { step, kind, text, vehicle });
+    }
+
+    fn put(&mut self, at: usize, event: Event) {
         if self.events.len() < MOST_EVENTS {
-            self.events.push(Event { step, kind, text, vehicle });
+            self.events.insert(at, event);
         } else {
             self.more_events += 1;
         }
@@ -248,6 +295,21 @@ impl Index {
             let stride = self.stride;
             self.traces.retain(|trace| u64::from(trace.step).is_multiple_of(stride));
         }
+    }
+
+    /// The first step in which the state is not that of another run; `None` where it is as far as both are known.
+    pub fn differs_from(&self, other: &Index) -> Option<u64> {
+        let shared = self.lines.len().min(other.lines.len());
+        let (own, theirs) = (&self.lines[..shared], &other.lines[..shared]);
+        let is_same =
+            |at: usize| (own[at].step, own[at].state_hash) == (theirs[at].step, theirs[at].state_hash);
+        // A hash holds all that was before: once they differ they stay so.
+        let (mut same, mut different) = (0, shared);
+        while same < different {
+            let middle = usize::midpoint(same, different);
+            if is_same(middle) { same = middle + 1 } else { different = middle }
+        }
+        own.get(same).map(|line| line.step)
     }
 
     /// The last step up to this one in which a zone's coordinator acted.

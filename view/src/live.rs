@@ -1,13 +1,12 @@
 //! A run that goes on, as the page sees it.
 
-use crate::index::EventKind;
 use crate::run::{Live, Run};
 use crate::steps::{Kept, Steps};
 use control_zones::process::{Notice, ProcessError, Steering, Watched};
 use control_zones::record::Metadata;
 use control_zones::scenario::Scenario;
 use control_zones::step::Step;
-use control_zones::transport::iox::{Condition, Leftover, RunName, clean};
+use control_zones::transport::iox::RunName;
 use serde_json::{Value, json};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -60,6 +59,7 @@ impl Live for Going {
             "pace": notice.pace,
             "missed_steps": notice.missed_steps,
             "late_frames": notice.late_frames,
+            "left_out_steps": notice.left_out_steps,
             "refused": notice.refused,
             "members": notice.members,
         })
@@ -99,13 +99,10 @@ impl Steps for Shared {
     fn step(&self, number: u64) -> Result<Option<Step>, String> {
         self.0.step(number)
     }
-}
 
-/// Looks at a run, if it is there; entering it before would be in the way of who begins it.
-pub fn open(name: &RunName) -> Result<Option<(Watched, Metadata, Arc<Scenario>)>, ProcessError> {
-    let found = clean(true)?;
-    let is_there = |run: &Leftover| run.condition == Condition::Alive && run.name == name.to_string();
-    if found.iter().any(is_there) { Watched::open(name) } else { Ok(None) }
+    fn last_until(&self, number: u64) -> Option<u64> {
+        self.0.last_until(number)
+    }
 }
 
 /// Begins to look at a run as soon as it is there, which it is to be within this time; `goes_on` says whether it can
@@ -163,8 +160,10 @@ fn take(
     steering: &Receiver<Steering>,
     stopped: &Receiver<()>,
 ) {
+    // The processes of the run go first.
+    let _ = rustix::process::nice(Watched::NICENESS);
     let (watched, metadata, scenario) = loop {
-        match open(name) {
+        match Watched::find(name) {
             Ok(Some(opened)) => break opened,
             Ok(None) => {}
             Err(error) => {
@@ -221,8 +220,6 @@ fn follow(
             take_notice(run, &mut locked(progress), notice);
         }
         while let Ok(wish) = steering.try_recv() {
-            let step = run.steps.range().map_or(0, |(_, last)| last);
-            run.index().say(step, EventKind::Steered, words(&wish), None);
             watched.steer(&wish)?;
         }
         if is_idle {
@@ -235,32 +232,10 @@ fn follow(
 }
 
 fn take_notice(run: &Run, progress: &mut Progress, notice: Notice) {
-    let step = notice.step;
-    if notice.missed_steps > progress.notice.missed_steps {
-        let more = notice.missed_steps - progress.notice.missed_steps;
-        run.index().say(
-            step,
-            EventKind::Missed,
-            format!("{more} steps were not done by their deadlines"),
-            None,
-        );
-    }
-    for refused in notice.refused.iter().filter(|text| !progress.notice.refused.contains(text)) {
-        run.index().say(step, EventKind::Refused, refused.clone(), None);
-    }
+    run.index().take_events(&notice.events);
     let latencies = (notice.first_latency..).zip(notice.latency_us.iter().copied());
     progress.latencies.extend(latencies);
     let surplus = progress.latencies.len().saturating_sub(MOST_LATENCIES);
     progress.latencies.drain(..surplus);
     progress.notice = notice;
-}
-
-fn words(steering: &Steering) -> String {
-    match steering {
-        Steering::Pause => "steered: pause".to_owned(),
-        Steering::Resume => "steered: go on".to_owned(),
-        Steering::Step(steps) => format!("steered: {steps} steps"),
-        Steering::Pace(pace) if *pace == 0.0 => "steered: as fast as it can".to_owned(),
-        Steering::Pace(pace) => format!("steered: {pace} times real time"),
-    }
 }

@@ -11,6 +11,8 @@ pub struct NetworkView {
     zones: Vec<ZoneView>,
     /// Links with a length, by zone and exit: as records number them.
     links: Vec<LinkView>,
+    /// From an exit to the entrance that follows at once, where it is drawn elsewhere.
+    joins: Vec<Vec<Place>>,
     kinds: Vec<KindView>,
 }
 
@@ -63,7 +65,7 @@ struct PointView {
 struct LinkView {
     zone: ZoneId,
     length_m: f64,
-    shape: [Place; 2],
+    shape: Vec<Place>,
 }
 
 #[derive(Debug, Serialize)]
@@ -126,15 +128,21 @@ impl NetworkView {
         });
         let exits =
             (0..).zip(&network.zones).flat_map(|(id, zone)| (0..).zip(&zone.exits).map(move |e| (id, e)));
-        let links = exits.filter_map(|(zone, (at, exit))| {
+        let links = exits.clone().filter_map(|(zone, (at, exit))| {
             let length_m = exit.to.map(|to| to.link_m).filter(|length_m| *length_m > 0.0)?;
             Some(LinkView { zone, length_m, shape: shapes.link(network, zone, at)? })
         });
+        let joins = exits.clone().filter_map(|(zone, (at, exit))| {
+            let join =
+                shapes.link(network, zone, at).filter(|_| exit.to.is_some_and(|to| to.link_m == 0.0))?;
+            (join[0] != join[join.len() - 1]).then_some(join)
+        });
+        let joins = joins.collect();
         let kinds = scenario.fleet.iter().map(|kind| KindView {
             name: kind.name.clone(),
             length_m: kind.vehicle.length_m,
             v_max_mps: kind.vehicle.v_max_mps,
         });
-        NetworkView { zones: zones.collect(), links: links.collect(), kinds: kinds.collect() }
+        NetworkView { zones: zones.collect(), links: links.collect(), joins, kinds: kinds.collect() }
     }
 }

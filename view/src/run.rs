@@ -83,6 +83,7 @@ impl Run {
             let some: Vec<_> = steps.by_ref().take(AT_ONCE).collect();
             let mut index = self.index();
             if some.is_empty() {
+                index.take_events(reader.events());
                 index.is_complete = true;
                 return;
             }

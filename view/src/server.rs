@@ -175,7 +175,11 @@ fn answer(served: &Served, what: &str, q: &Question) -> Response {
             return Json(served.runs.iter().map(|run| run.describe()).collect::<Value>()).into_response();
         }
         "status" => {
-            return Json(served.runs.iter().map(|run| run.status()).collect::<Value>()).into_response();
+            let mut all: Vec<Value> = served.runs.iter().map(|run| run.status()).collect();
+            if let [first, second] = &served.runs[..] {
+                all[1]["differs_at"] = json!(second.index().differs_from(&first.index()));
+            }
+            return Json(all).into_response();
         }
         _ => {}
     }

@@ -11,6 +11,8 @@ pub trait Steps: Send + Sync {
     fn range(&self) -> Option<(u64, u64)>;
     /// One of them, or why it cannot be read; `None` when it is not there.
     fn step(&self, number: u64) -> Result<Option<Step>, String>;
+    /// The last one up to this number that is there.
+    fn last_until(&self, number: u64) -> Option<u64>;
 }
 
 impl Steps for Reader<FileSource> {
@@ -22,6 +24,10 @@ impl Steps for Reader<FileSource> {
 
     fn step(&self, number: u64) -> Result<Option<Step>, String> {
         Reader::step(self, number).map_err(|damage| format!("damaged at {damage}"))
+    }
+
+    fn last_until(&self, number: u64) -> Option<u64> {
+        self.step_numbers().rev().find(|step| *step <= number)
     }
 }
 
@@ -67,5 +73,9 @@ impl Steps for Kept {
         let blocks = self.blocks();
         let Some(block) = blocks.by_step.get(&number) else { return Ok(None) };
         Step::decode(block).map(Some).map_err(|fault| fault.to_string())
+    }
+
+    fn last_until(&self, number: u64) -> Option<u64> {
+        self.blocks().by_step.range(..=number).next_back().map(|(step, _)| *step)
     }
 }

@@ -1,6 +1,5 @@
 //! A run that goes on, in a terminal: zones, processes, how long steps take.
 
-use crate::live::open;
 use clap::Parser;
 use control_zones::process::{Notice, Place, Steering, Watched};
 use control_zones::scenario::Scenario;
@@ -59,7 +58,7 @@ fn watch(args: &Top) -> Result<(), String> {
     };
     let deadline = Instant::now() + Duration::from_secs(2);
     let (watched, metadata, scenario) = loop {
-        match open(&name).map_err(|error| error.to_string())? {
+        match Watched::find(&name).map_err(|error| error.to_string())? {
             Some(opened) => break opened,
             None if Instant::now() >= deadline => {
                 return Err(format!("there is no run {name} that can be looked at"));

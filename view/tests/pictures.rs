@@ -1,10 +1,11 @@
-//! The pictures of docs/view.md and of the README:
+//! The pictures of the documents, and some more to be looked at after a change:
 //!
 //! ```text
 //! cargo test -p cz-view --test pictures -- --ignored
 //! ```
 //!
-//! writes them to docs/figures, or to `CZ_PICTURES` where that is set. Needs a Chromium.
+//! writes those of the documents to docs/figures, or all to `CZ_PICTURES` where that is set. Needs a Chromium, and for the
+//! picture of a report `cz-report` beside `cz-view`.
 
 #![allow(clippy::unwrap_used)]
 
@@ -12,9 +13,12 @@ mod common;
 
 use common::browser::Browser;
 use common::{Page, record, record_as};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 
-const SIZE: (u32, u32) = (1440, 900);
+const SIZE: (u32, u32) = (1240, 780);
+/// Those the documents use.
+const IN_DOCUMENTS: [&str; 2] = ["view-merge.png", "view-vehicle.png"];
 const READY: &str =
     "window.view && view.state.maps?.length && view.state.runs.every(r => r.status.is_complete)";
 
@@ -35,6 +39,9 @@ struct Shot<'a> {
 
 fn take(browser: &Browser, page: &Page, shot: &Shot<'_>) {
     let Shot { name, step, script, chooses } = shot;
+    if std::env::var_os("CZ_PICTURES").is_none() && !IN_DOCUMENTS.contains(name) {
+        return;
+    }
     browser.open(page.address());
     browser.until(READY);
     browser.evaluate("view.setTheme('light')");
@@ -58,10 +65,31 @@ fn take(browser: &Browser, page: &Page, shot: &Shot<'_>) {
     std::thread::sleep(std::time::Duration::from_millis(2500));
     browser.evaluate("view.state.dirty = true");
     std::thread::sleep(std::time::Duration::from_millis(700));
+    keep(browser, name);
+}
+
+fn keep(browser: &Browser, name: &str) {
     let path = figures().join(name);
     browser.picture(&path);
     println!("{} ({} kB)", path.display(), std::fs::metadata(&path).unwrap().len() / 1000);
     assert_eq!(browser.complaints(), Vec::<String>::new());
+}
+
+/// What `cz report` makes of a recording, where its figures begin.
+fn report(browser: &Browser, recording: &Path) {
+    let program = Path::new(env!("CARGO_BIN_EXE_cz-view")).with_file_name("cz-report");
+    if !program.is_file() {
+        eprintln!("{} is not built: no picture of a report", program.display());
+        return;
+    }
+    let directory = tempfile::tempdir().unwrap();
+    let page = directory.path().join("report.html");
+    let made = Command::new(program).arg(recording).arg("--out").arg(&page).output().unwrap();
+    assert!(made.status.success(), "{made:?}");
+    browser.open(&format!("file://{}", page.display()));
+    browser.evaluate("document.querySelector('#figures').scrollIntoView()");
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    keep(browser, "report.png");
 }
 
 #[test]
@@ -77,6 +105,7 @@ fn pictures() {
         &page,
         &shot("view-dark.png", 1500, "view.setTheme('dark'); view.setColour('verdict'); view.panel(1)", None),
     );
+    report(&browser, merge.path());
     let intersection = record("intersection", &[]);
     let page = Page::of(&[intersection.path()]);
     take(&browser, &page, &shot("view-intersection.png", 600, "view.zoom(2)", None));

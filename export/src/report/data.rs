@@ -92,7 +92,7 @@ impl Run {
         });
         let Ok(ended) = ended;
         let Gathering { ways, margins, least, events, trips, inside, departed, late, end_s, .. } = gathering;
-        let events = events.finish();
+        let events = events.finish(reader.events());
         let speeds = ways.values().flatten().map(|sample: &Sample| sample.v_mps);
         let fastest_mps = (speeds.fold(1.0, f64::max) / 5.0).ceil() * 5.0;
         Run {

@@ -619,8 +619,8 @@ impl<'a> Map<'a> {
         let network = &self.run.scenario.network;
         for (id, zone) in (0..).zip(&network.zones) {
             for exit in 0..zone.exits.len() as u32 {
-                if let Some([from, to]) = self.shapes.link(network, id, exit) {
-                    lane(area, view, &[from, to], PALE, 5)?;
+                if let Some(link) = self.shapes.link(network, id, exit) {
+                    lane(area, view, &link, PALE, 5)?;
                 }
             }
             for shape in self.shapes.segments(id) {

@@ -20,6 +20,9 @@ use std::path::{Path, PathBuf};
 
 /// Time-space diagrams that are drawn at most.
 const DIAGRAMS: usize = 12;
+/// Width of the page, and of a second in time-space diagrams, pixels.
+const PAGE_PX: f64 = 1100.0;
+const PX_PER_S: f64 = 1.6;
 /// Zones whose profiles and margins are drawn at most.
 const ZONES: usize = 9;
 
@@ -128,7 +131,9 @@ fn figures_of<'a>(runs: &'a [Run], latency: &'a [Latency]) -> Vec<Figure<'a>> {
     most.sort_by_key(|(way, count)| (std::cmp::Reverse(*count), *way));
     most.truncate(DIAGRAMS);
     most.sort();
-    let width = (run.end_s * 4.0).clamp(1100.0, 4000.0) as u32;
+    // As wide as the page up to eleven minutes; what is longer is scrolled.
+    let width = (run.end_s * PX_PER_S).clamp(PAGE_PX, 4000.0) as u32;
+    let goes_on = if f64::from(width) > PAGE_PX { " It goes on to the right." } else { "" };
     let left_out = used.len().saturating_sub(DIAGRAMS);
     for ((zone, path), count) in most {
         let (zone_name, path_name) =
@@ -143,7 +148,7 @@ fn figures_of<'a>(runs: &'a [Run], latency: &'a [Latency]) -> Vec<Figure<'a>> {
             caption: format!(
                 "Each line is a vehicle, coloured by its speed; thick where it braked in feasibility enforcement or could \
                  not satisfy its rows. Dashed: conflict points, with grey dots where vehicles of other paths pass \
-                 them.{rest}"
+                 them.{goes_on}{rest}"
             ),
             size: (width, 460),
             what: What::TimeSpace { run, zone, path },

@@ -376,8 +376,10 @@ fn events(page: &mut String, run: &Run) {
         (EventKind::Infeasible, "Rows that no acceleration satisfied"),
         (EventKind::FeasibilityEnforcement, "Feasibility enforcement"),
         (EventKind::Overruled, "Another acceleration than commanded"),
-        (EventKind::Late, "Controllers that were late"),
-        (EventKind::Replaced, "Controllers that were replaced"),
+        (EventKind::Late, "Processes that were late"),
+        (EventKind::Replaced, "Processes that were replaced"),
+        (EventKind::Refused, "Senders whose frames were refused"),
+        (EventKind::Steered, "Steering"),
     ];
     for (kind, name) in kinds {
         let all: Vec<&Event> = run.events_of(kind).collect();
@@ -415,8 +417,11 @@ fn events(page: &mut String, run: &Run) {
                 text(&event.reason),
             ]
         });
-        let who =
-            if matches!(kind, EventKind::Late | EventKind::Replaced) { "#controller" } else { "#vehicle" };
+        let who = match kind {
+            EventKind::Late | EventKind::Replaced => "#controller",
+            EventKind::Refused | EventKind::Steered => "",
+            _ => "#vehicle",
+        };
         table(page, &["#steps", "#from [s]", "#for [s]", "zone", who, "why"], rows.collect::<Vec<_>>());
     }
 }

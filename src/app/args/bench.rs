@@ -24,6 +24,8 @@ pub(in crate::app) enum BenchKind {
     Scale(ScaleArgs),
     /// The ways of waiting beside each other, on a quiet machine and on a busy one, and what `cz run` does at first.
     Wait(WaitBenchArgs),
+    /// A step while somebody looks at the run, beside one while nobody does.
+    View(ViewBenchArgs),
     /// The other process of a measurement.
     #[command(hide = true)]
     Peer(PeerArgs),
@@ -69,6 +71,15 @@ pub(in crate::app) struct WaitBenchArgs {
     /// The program `cz` of another build, measured beside this one's ways of waiting with its default.
     #[arg(long, value_name = "FILE")]
     pub beside: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct ViewBenchArgs {
+    #[command(flatten)]
+    pub measure: MeasureArgs,
+    /// Runs with and without a view of each scene, by turns.
+    #[arg(long, value_name = "N", default_value_t = 5)]
+    pub repetitions: usize,
 }
 
 #[derive(Debug, Args)]

@@ -9,7 +9,7 @@ mod scenario;
 
 use crate::compare::cli::CompareArgs;
 use crate::reproduce::cli::ReproduceArgs;
-pub(super) use bench::{BenchArgs, BenchKind, MeasureArgs, PeerArgs, WaitBenchArgs};
+pub(super) use bench::{BenchArgs, BenchKind, MeasureArgs, PeerArgs, ViewBenchArgs, WaitBenchArgs};
 use clap::{Args, Parser, Subcommand};
 pub(super) use conduct::{ConductArgs, Restart, ShareArgs, SteeringArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};

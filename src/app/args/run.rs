@@ -25,6 +25,10 @@ pub(in crate::app) struct RunArgs {
     /// Record every frame of the run in this file (.czlog); an older recording is replaced.
     #[arg(long, value_name = "FILE")]
     pub record: Option<PathBuf>,
+    /// Write what each process did when, in wall-clock time (computing, publishing, waiting), to this file, which
+    /// Perfetto reads.
+    #[arg(long, value_name = "FILE.json", conflicts_with = "in_process")]
+    pub trace: Option<PathBuf>,
     /// Watch the run in the browser (the program cz-view), which may steer it.
     #[arg(long, conflicts_with = "in_process")]
     pub view: bool,

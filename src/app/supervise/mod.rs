@@ -19,6 +19,7 @@ use crate::process::{
 };
 use crate::record::Reader;
 use crate::scenario::Plugin;
+use crate::trace;
 use crate::transport::iox::{RunName, RunSpace, clean};
 use child::{Event, Stdout};
 use crossbeam::channel::{Receiver, Sender, bounded, select, unbounded};
@@ -45,6 +46,8 @@ pub(super) struct Plan<'a> {
     pub run_id: u64,
     /// The recording the run goes on from, and so many of its steps.
     pub resume: Option<(&'a Path, u64)>,
+    /// Where what each process did when is written.
+    pub trace: Option<&'a Path>,
 }
 
 /// Events that may wait to be dealt with: whoever floods us waits.
@@ -83,12 +86,16 @@ pub(super) fn conduct(
         Err(error) => (None, Err(error)),
     };
     bar.iter().for_each(|bar| bar.finish());
+    let events = outcome.as_ref().map_or_else(|_| Vec::new(), |outcome| outcome.events.clone());
     let (outcome, delivered) = match outcome {
         Ok(outcome) => (Ok(()), deliver(outcome)),
         Err(error) => (Err(error), Ok(())),
     };
     let recording = match observation.map(Observation::stop) {
-        Some(Ok(recording)) => Some(recording),
+        Some(Ok(mut recording)) => {
+            recording.happened(&events);
+            Some(recording)
+        }
         Some(Err(error)) => {
             super::say::say(format_args!("cz: the recording broke off: {error}"));
             None
@@ -96,8 +103,10 @@ pub(super) fn conduct(
         None => recording,
     };
     let recorded = record::finish(recording, path.as_deref(), &outcome);
+    let mut traced = Ok(());
     if let Some(family) = family {
         family.close();
+        traced = plan.trace.map_or(Ok(()), put_together);
         // Whoever is still alive in the space keeps it; then there is nothing to be swept.
         let _ = RunSpace::sweep(&plan.run);
         if outcome.is_err() {
@@ -105,7 +114,18 @@ pub(super) fn conduct(
             let _ = clean(false);
         }
     }
-    outcome.map_err(|error| point_to(path, error)).and(delivered).and(recorded)
+    outcome.map_err(|error| point_to(path, error)).and(delivered).and(recorded).and(traced)
+}
+
+/// Puts together what the processes of a run have written of themselves.
+fn put_together(path: &Path) -> Result<(), AppError> {
+    let failed = |error| AppError::Failed(format!("--trace {}: cannot be written: {error}", path.display()));
+    let parts = trace::put_together(path).map_err(failed)?;
+    super::say::say(format_args!(
+        "cz: {} has what {parts} processes did; ui.perfetto.dev shows it",
+        path.display()
+    ));
+    Ok(())
 }
 
 /// Says how the run can go on, where something of it has been recorded.
@@ -141,7 +161,7 @@ struct Recipe {
     kind: Kind,
     /// Of `cz`.
     arguments: Vec<OsString>,
-    environment: Vec<(&'static str, String)>,
+    environment: Vec<(&'static str, OsString)>,
     /// The process that was started so last.
     process: Option<u32>,
     /// Where it is and what it was granted.
@@ -216,7 +236,8 @@ impl Family {
             argument.push(path);
             world.insert(1, argument);
         }
-        self.add("world".to_owned(), Kind::World, world, Vec::new());
+        let traced: Vec<_> = plan.trace.map(|path| (trace::VARIABLE, path.into())).into_iter().collect();
+        self.add("world".to_owned(), Kind::World, world, traced.clone());
         for (role, command, count) in
             [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
         {
@@ -226,13 +247,13 @@ impl Family {
                 arguments.extend(plan.conduct.wait.to_flags());
                 arguments.extend(["--index".to_owned(), index.to_string()]);
                 let arguments = arguments.into_iter().map(OsString::from).collect();
-                self.add(format!("{role} {index}"), Kind::Part, arguments, Vec::new());
+                self.add(format!("{role} {index}"), Kind::Part, arguments, traced.clone());
             }
         }
         for Plugin { name, command, .. } in plan.plugins {
             let Some(command) = command else { continue };
             let arguments = ["keep", "--supervised", &supervisor, "--", command].map(OsString::from).to_vec();
-            let environment = vec![("CZ_RUN", run.clone()), ("CZ_CONTROLLER", name.clone())];
+            let environment = vec![("CZ_RUN", run.clone().into()), ("CZ_CONTROLLER", name.into())];
             self.add(format!("controller {name}"), Kind::Plugin, arguments, environment);
         }
     }
@@ -242,7 +263,7 @@ impl Family {
         name: String,
         kind: Kind,
         arguments: Vec<OsString>,
-        environment: Vec<(&'static str, String)>,
+        environment: Vec<(&'static str, OsString)>,
     ) {
         self.life.add(name, kind);
         self.recipes.push(Recipe { kind, arguments, environment, process: None, settled: None });

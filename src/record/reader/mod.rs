@@ -17,7 +17,7 @@ pub use source::{FileSource, Source};
 pub use steps::Steps;
 
 use super::block::{BlockHead, HEAD};
-use super::format::{Digest, END_MAGIC, Entry, Footer, Metadata, Seal, digest};
+use super::format::{Digest, END_MAGIC, Entry, Footer, Metadata, RunEvent, Seal, digest};
 use crate::scenario::Scenario;
 use crate::step::Step;
 use end::End;
@@ -89,6 +89,11 @@ impl<S: Source> Reader<S> {
     /// What is known at the end, when the file was closed in order.
     pub fn footer(&self) -> Option<&Footer> {
         self.end.as_ref().map(|end| &end.footer)
+    }
+
+    /// What happened to the run beside its steps; nothing is known where the recording was cut off.
+    pub fn events(&self) -> &[RunEvent] {
+        self.footer().map_or(&[], |footer| &footer.events)
     }
 
     /// Bytes of the file.

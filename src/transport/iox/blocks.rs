@@ -2,16 +2,18 @@
 //! that says when it is full.
 
 use super::error::{SpaceError, failed};
+use super::ports::process_behind;
 use super::space::{RunSpace, service_name};
 use crate::transport::TransportError;
 use iceoryx2::port::BackpressureAction;
 use iceoryx2::port::publisher::Publisher;
 use iceoryx2::port::subscriber::Subscriber;
-use iceoryx2::prelude::AllocationStrategy;
+use iceoryx2::prelude::{AllocationStrategy, CallbackProgression};
 use iceoryx2::sample::Sample;
 use iceoryx2::service::ipc;
 use iceoryx2::service::port_factory::PortFactory as _;
 use iceoryx2::service::port_factory::publish_subscribe::PortFactory;
+use rustix::process::{Pid, test_kill_process};
 
 /// The sending end, which also keeps the service.
 #[derive(Debug)]
@@ -22,9 +24,15 @@ pub struct BlockOutbox {
 }
 
 impl BlockOutbox {
-    /// Whether somebody has opened the other end.
+    /// Whether somebody has opened the other end, and lives: whoever was killed has not closed it.
     pub fn has_reader(&self) -> bool {
-        self.factory.dynamic_config().number_of_subscribers() > 0
+        let mut has_one = false;
+        self.factory.dynamic_config().list_subscribers(|subscriber| {
+            let process = process_behind(&subscriber.node_id).and_then(|id| Pid::from_raw(id as i32));
+            has_one = process.is_none_or(|process| test_kill_process(process).is_ok());
+            if has_one { CallbackProgression::Stop } else { CallbackProgression::Continue }
+        });
+        has_one
     }
 
     /// Sends a block of that many bytes, which `fill` writes piece by piece where it will be read. `false` when

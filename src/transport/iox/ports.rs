@@ -1,6 +1,7 @@
 //! The boxes over iceoryx2 ports.
 
 use super::bell::{BellRope, ring_all};
+use crate::trace::{self, Phase};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
 use iceoryx2::identifiers::UniqueNodeId;
 use iceoryx2::port::publisher::Publisher;
@@ -50,6 +51,7 @@ impl<R: Record> Outbox<R> for IoxOutbox<R> {
         count: usize,
         fill: impl FnOnce(&mut Slots<'_, R>),
     ) -> Result<IoxLoan<'_, R>, TransportError> {
+        trace::enter(Phase::Publish);
         let mut sample = self.publisher.loan_slice_uninit(count).map_err(|error| match error {
             LoanError::ExceedsMaxLoans => {
                 unreachable!("a loan borrows the outbox, so there is never a second one")
@@ -99,6 +101,7 @@ impl<R: Record> Loan<R> for IoxLoan<'_, R> {
             reason: format!("{error:?}"),
         })?;
         ring_all(self.bells);
+        trace::enter(Phase::Compute);
         Ok(reached)
     }
 }
@@ -130,7 +133,11 @@ impl<R: Record> Inbox<R> for IoxInbox<R> {
 
     fn receive(&mut self) -> Result<Option<IoxFrame<R>>, TransportError> {
         match self.subscriber.receive() {
-            Ok(sample) => Ok(sample.map(|sample| IoxFrame { sample })),
+            Ok(Some(sample)) => {
+                trace::begin(Phase::Compute, sample.user_header().step);
+                Ok(Some(IoxFrame { sample }))
+            }
+            Ok(None) => Ok(None),
             // Nothing but frames of senders of whom enough is held already.
             Err(ReceiveError::ExceedsMaxBorrows) => Ok(None),
             Err(error) => {
@@ -153,7 +160,7 @@ impl<R: Record> Inbox<R> for IoxInbox<R> {
 }
 
 /// The process a node belongs to.
-fn process_behind(node: &UniqueNodeId) -> Option<u32> {
+pub(super) fn process_behind(node: &UniqueNodeId) -> Option<u32> {
     node.pid::<ipc::Service>().ok().map(|pid| pid.value() as u32)
 }
 

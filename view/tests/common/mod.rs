@@ -6,7 +6,7 @@ pub mod browser;
 
 use control_zones::process::{StopFlag, run_in_process_observed};
 use control_zones::record::{Metadata, Processes, Recorder, RunEnd, ScenarioSource};
-use control_zones::scenario::{Override, load_embedded};
+use control_zones::scenario::{Override, Scenario, load_embedded};
 use serde_json::Value;
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
@@ -34,11 +34,16 @@ pub fn record(name: &str, set: &[&str]) -> Recording {
 
 /// The same, in a file of that name.
 pub fn record_as(file: &str, name: &str, set: &[&str]) -> Recording {
-    let directory = tempfile::tempdir().unwrap();
-    let path = directory.path().join(file);
     let overrides: Vec<Override> =
         set.iter().filter(|set| **set != "--set").map(|set| set.parse().unwrap()).collect();
-    let scenario = Arc::new(load_embedded(name, &overrides, None).unwrap());
+    record_steps(file, load_embedded(name, &overrides, None).unwrap(), |_| true)
+}
+
+/// Runs a scenario in this process and records some of its steps.
+pub fn record_steps(file: &str, scenario: Scenario, keeps: impl Fn(u64) -> bool) -> Recording {
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join(file);
+    let scenario = Arc::new(scenario);
     let processes = Processes { coordinators: 1, controllers: 1 };
     let metadata = Metadata::new(&scenario, ScenarioSource::default(), 1, processes);
     let mut recorder = Recorder::create(&path, &metadata).unwrap();
@@ -50,7 +55,7 @@ pub fn record_as(file: &str, name: &str, set: &[&str]) -> Recording {
         &stop,
         |_| {},
         |frames| {
-            assert!(recorder.push_or_wait(frames));
+            assert!(!keeps(frames.header.step) || recorder.push_or_wait(frames));
         },
     )
     .unwrap();
