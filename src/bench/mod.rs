@@ -21,7 +21,7 @@ pub use scale::{ScaleOptions, ScaleReport, scale};
 pub use side_by_side::{Family, side_by_side};
 pub use solver::{SolverReport, solver};
 pub use sumo::{Sumo, SumoSide};
-pub use viewed::{Seen, ViewedOptions, ViewedPoint, ViewedReport, look, viewed};
+pub use viewed::{RunSeen, Seen, ViewedOptions, ViewedPoint, ViewedReport, look, viewed};
 pub(crate) use waiting::median;
 pub use waiting::{NINE, Side, THREE, Timed, WaitingOptions, WaitingPoint, WaitingReport, waiting};
 

@@ -9,6 +9,9 @@ use crate::transport::iox::RunName;
 use serde::Serialize;
 use std::time::{Duration, Instant};
 
+/// A run of a scene while somebody looks, to its end or only until it has begun.
+pub type RunSeen<'a> = dyn Fn(&str, bool) -> Result<(Timed, Seen), BenchError> + 'a;
+
 /// What to measure, and how.
 pub struct ViewedOptions<'a> {
     /// Runs, by name.
@@ -16,7 +19,7 @@ pub struct ViewedOptions<'a> {
     /// Runs of each side, by turns.
     pub repetitions: usize,
     /// Runs a scene while a process looks at it, to its end or only until it has begun.
-    pub run: &'a dyn Fn(&str, bool) -> Result<(Timed, Seen), BenchError>,
+    pub run: &'a RunSeen<'a>,
 }
 
 /// What whoever looked has seen.

@@ -8,7 +8,7 @@ const EVENTS = { infeasible: "--v-3", missed: "--m-other", replaced: "--accent",
 // Warm is slow, cool is fast: told apart with any kind of colour vision, and from what is behind.
 const RAMPS = {
   light: [[150, 30, 0], [224, 96, 10], [244, 180, 10], [48, 170, 160], [28, 116, 204], [24, 60, 150]],
-  dark: [[255, 84, 52], [255, 146, 46], [250, 208, 84], [84, 204, 186], [82, 172, 252], [168, 212, 255]],
+  dark: [[255, 84, 52], [255, 146, 46], [250, 208, 84], [84, 204, 186], [82, 172, 252], [120, 150, 255]],
 };
 const BINS = 24;
 
@@ -361,7 +361,7 @@ class CzMap {
     this.listen();
   }
   resize() {
-    const { width, height } = this.box.getBoundingClientRect(), ratio = devicePixelRatio || 1;
+    const { clientWidth: width, clientHeight: height } = this.canvas, ratio = devicePixelRatio || 1;
     this.width = width; this.height = height;
     this.canvas.width = Math.round(width * ratio);
     this.canvas.height = Math.round(height * ratio);

@@ -119,7 +119,7 @@ fn pixel(browser: &Browser, place: &str) -> (f64, f64) {
 #[test]
 fn a_zone_that_is_clicked_tells_its_order_and_v_m() {
     let Some(browser) = Browser::start((1440, 900)) else { return };
-    let file = record("two-merges", &["--set", "end.vehicles=50"]);
+    let file = record("paper", &["--set", "end.vehicles=50"]);
     let page = Page::of(&[file.path()]);
     browser.open(page.address());
     browser.until(READY);
