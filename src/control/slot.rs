@@ -116,6 +116,14 @@ pub fn free_duration_s(beta: f64, v_mps: f64, distance_m: f64, guess_s: f64) -> 
     1.0 / y
 }
 
+/// Whether a duration is below that of the optimum for `beta`, without working the latter out.
+#[inline]
+pub fn is_sooner_than_free(beta: f64, v_mps: f64, distance_m: f64, time_s: f64) -> bool {
+    let (l, v) = (distance_m, v_mps);
+    let y = 1.0 / time_s;
+    time_s <= 0.0 || (l * y > v && 1.5 * y * y * (l * y - v) * (3.0 * l * y - v) > beta)
+}
+
 /// From any guess the root is found in fewer.
 const ROUNDS: u32 = 96;
 
@@ -232,6 +240,9 @@ mod tests {
             let found = free_duration_s(beta, v, l, guess);
             prop_assert!((found - best.duration_s).abs() <= 1e-9 * best.duration_s, "{} {}", found, best.duration_s);
             prop_assert!((acceleration_mps2(l, v, found) - best.b).abs() <= 1e-6);
+            prop_assert!(is_sooner_than_free(beta, v, l, (1.0 - 1e-9) * found));
+            prop_assert!(!is_sooner_than_free(beta, v, l, (1.0 + 1e-9) * found));
+            prop_assert!(is_sooner_than_free(beta, v, l, 0.0));
         }
 
         #[test]

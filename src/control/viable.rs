@@ -211,8 +211,12 @@ impl Viable {
     /// The plan that is at a place when it is scheduled to be.
     fn scheduled(&self, s: &Situation, distance_m: f64, time_s: f64) -> Plan {
         // Whoever has been held up does not chase a schedule made before.
-        let guess_s = if time_s > 0.0 { time_s } else { distance_m / s.v_mps.max(1.0) };
-        let time_s = time_s.max(slot::free_duration_s(HASTE * self.beta, s.v_mps, distance_m, guess_s));
+        let beta = HASTE * self.beta;
+        let time_s = if slot::is_sooner_than_free(beta, s.v_mps, distance_m, time_s) {
+            slot::free_duration_s(beta, s.v_mps, distance_m, distance_m / s.v_mps.max(1.0))
+        } else {
+            time_s
+        };
         let Terminal::Speed(w) = s.terminal else {
             return Plan { aim: Aim::Scheduled, ..self.for_slot(s, distance_m, time_s) };
         };

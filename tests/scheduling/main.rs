@@ -8,7 +8,7 @@ mod runs;
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{DefaultSettingsBuilder, DefaultSolver, IPSolver, NonnegativeConeT, SolverStatus};
 use control_zones::coordination::schedule::cost::{Convex, Cost, Single, Tandem};
-use control_zones::coordination::schedule::pooling::{Headway, Pooling, is_chain};
+use control_zones::coordination::schedule::pooling::{Headway, Pooling, best_s, is_chain};
 use proptest::prelude::*;
 
 fn cases(cases: u32) -> ProptestConfig {
@@ -125,9 +125,13 @@ proptest! {
     }
 }
 
+fn alone_s<C: Convex>(costs: &[C]) -> Vec<f64> {
+    costs.iter().map(best_s).collect()
+}
+
 fn optimum<C: Convex + Clone>(cost: &C) -> f64 {
     let mut times = Vec::new();
-    Pooling::default().minimise(std::slice::from_ref(cost), &[0.0], &[], &mut times);
+    Pooling::default().minimise(std::slice::from_ref(cost), &[best_s(cost)], &[0.0], &[], &mut times);
     times[0]
 }
 
@@ -214,7 +218,7 @@ proptest! {
         let costs: Vec<Quadratic> = drawn.iter().map(|&(weight, best, _)| Quadratic { weight, best }).collect();
         let earliest: Vec<f64> = drawn.iter().map(|d| d.2).collect();
         let mut times = Vec::new();
-        Pooling::default().minimise(&costs, &earliest, &headways, &mut times);
+        Pooling::default().minimise(&costs, &alone_s(&costs), &earliest, &headways, &mut times);
         prop_assert!(keeps(&times, &earliest, &headways), "{times:?}");
         let value = |times: &[f64]| -> f64 {
             times.iter().zip(&costs).map(|(t, c)| 0.5 * c.weight * (t - c.best) * (t - c.best)).sum()
@@ -238,7 +242,7 @@ proptest! {
         let mut earliest = vec![0.0; costs.len()];
         earliest[0] = held_s;
         let mut times = Vec::new();
-        Pooling::default().minimise(&costs, &earliest, &headways, &mut times);
+        Pooling::default().minimise(&costs, &alone_s(&costs), &earliest, &headways, &mut times);
         prop_assert!(keeps(&times, &earliest, &headways));
         let mut behind = 0.0;
         for i in (0..costs.len()).rev() {
@@ -266,7 +270,7 @@ proptest! {
     ) {
         let costs: Vec<Cost> = vehicles.iter().map(|single| Cost::Single(*single)).collect();
         let mut times = Vec::new();
-        Pooling::default().minimise(&costs, &[0.0; 3], &gaps, &mut times);
+        Pooling::default().minimise(&costs, &alone_s(&costs), &[0.0; 3], &gaps, &mut times);
         prop_assert!(keeps(&times, &[0.0; 3], &gaps));
         let value = |times: &[f64]| times.iter().zip(&costs).map(|(t, c)| c.value(*t)).sum::<f64>();
         let own = value(&times);

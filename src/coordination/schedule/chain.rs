@@ -1,7 +1,7 @@
 //! From a zone's duties to headways, and to the instants at which its vehicles leave.
 
-use super::cost::{Convex, Cost};
-use super::pooling::{Headway, Pooling, root};
+use super::cost::Cost;
+use super::pooling::{Headway, Pooling, best_s};
 use crate::conflict::{Duties, Duty, DutyKind};
 
 /// Speeds that divide are taken to be at least this, m/s.
@@ -55,6 +55,7 @@ impl Passage {
 pub struct Chain {
     pooling: Pooling,
     headways: Vec<Headway>,
+    alone_s: Vec<f64>,
     earliest_s: Vec<f64>,
     speeds_mps: Vec<f64>,
     times_s: Vec<f64>,
@@ -76,18 +77,17 @@ impl Chain {
             cost.exit_mps(time_s).min(passage.v_max_mps).max(LEAST_SPEED_MPS)
         };
         let own = &passages[known..];
+        self.alone_s.clear();
+        self.alone_s.extend(costs.iter().map(best_s));
         self.times_s.clear();
-        self.times_s.extend(costs.iter().zip(own).map(|(cost, passage)| {
-            let (from, to) = cost.bracket_s();
-            root(|t| cost.slope(t), from, to).max(passage.soonest_s())
-        }));
+        self.times_s.extend(self.alone_s.iter().zip(own).map(|(alone_s, own)| alone_s.max(own.soonest_s())));
         for _ in 0..ROUNDS {
             self.speeds_mps.clear();
             let times = self.times_s.iter();
             self.speeds_mps.extend(costs.iter().zip(own).zip(times).map(|((c, p), &t)| speed(c, p, t)));
             self.separate(passages, duties, known);
-            let Chain { pooling, headways, earliest_s, times_s, .. } = self;
-            pooling.minimise(costs, earliest_s, headways, times_s);
+            let Chain { pooling, headways, alone_s, earliest_s, times_s, .. } = self;
+            pooling.minimise(costs, alone_s, earliest_s, headways, times_s);
         }
         &self.times_s
     }

@@ -48,11 +48,12 @@ struct Program<'a, C> {
 }
 
 impl Pooling {
-    /// Writes the best instants to `times_s`. Nobody is earlier than its `earliest_s`. `headways` are sorted by
-    /// `after`.
+    /// Writes the best instants to `times_s`. `alone_s` are the [best instants](best_s) of each alone. Nobody is earlier
+    /// than its `earliest_s`. `headways` are sorted by `after`.
     pub fn minimise<C: Convex>(
         &mut self,
         costs: &[C],
+        alone_s: &[f64],
         earliest_s: &[f64],
         headways: &[Headway],
         times_s: &mut Vec<f64>,
@@ -67,9 +68,8 @@ impl Pooling {
         self.is_active.clear();
         self.is_active.resize(headways.len(), false);
         let mut ready = 0;
-        for (i, cost) in costs.iter().enumerate() {
-            let (from, to) = cost.bracket_s();
-            self.at_s.push(root(|t| cost.slope(t), from, to).max(earliest_s[i]));
+        for (i, alone_s) in alone_s.iter().enumerate() {
+            self.at_s.push(alone_s.max(earliest_s[i]));
             ready += headways[ready..].iter().take_while(|h| h.after as usize == i).count();
             self.merge(&program, ready, i as u32, Side::Before);
         }
@@ -265,6 +265,14 @@ pub fn is_chain(headways: &[Headway]) -> bool {
 const STEPS: u32 = 120;
 /// Width at which a bracket counts as closed, relative to where it is.
 const CLOSED: f64 = 1e-14;
+/// The search ends when it has come to the same place twice, to this share of it.
+const FOUND: f64 = 1e-12;
+
+/// Where a cost is least.
+pub fn best_s(cost: &impl Convex) -> f64 {
+    let (from, to) = cost.bracket_s();
+    root(|t| cost.slope(t), from, to)
+}
 
 /// Where a rising function passes 0 within a bracket; an end of it when it does not.
 ///
@@ -278,7 +286,7 @@ pub fn root(f: impl Fn(f64) -> f64, from: f64, to: f64) -> f64 {
     if f_high <= 0.0 {
         return high;
     }
-    let mut last = 0;
+    let (mut last, mut before) = (0, f64::NAN);
     for step in 1..=STEPS {
         let width = high - low;
         if width <= CLOSED * high.abs().max(low.abs()) {
@@ -286,9 +294,16 @@ pub fn root(f: impl Fn(f64) -> f64, from: f64, to: f64) -> f64 {
         }
         let middle = 0.5 * (low + high);
         let falsi = low - f_low * (width / (f_high - f_low));
-        let at = if step % 3 == 0 || !(falsi > low && falsi < high) { middle } else { falsi };
+        let is_halving = step % 3 == 0 || !(falsi > low && falsi < high);
+        let at = if is_halving { middle } else { falsi };
         if at <= low || at >= high {
             break;
+        }
+        if !is_halving {
+            if (at - before).abs() <= FOUND * at.abs() {
+                return at;
+            }
+            before = at;
         }
         let value = f(at);
         if value == 0.0 {

@@ -1,8 +1,8 @@
 //! The schedule of one zone.
 
 use super::chain::{Chain, Passage};
-use super::cost::{Convex, Cost, Single, Tandem};
-use super::pooling::root;
+use super::cost::{Cost, Single, Tandem};
+use super::pooling::best_s;
 use crate::conflict::{Conflicts, Duties, Row};
 use crate::coordination::assign::row;
 use crate::scenario::{CoordinationParams, PassingOrder, Scenario, ScheduleKind, VehicleParams, ZoneId};
@@ -312,9 +312,7 @@ impl Beyond {
             } else {
                 let single =
                     Single { beta: scene.scenario.beta, left_m: passage.left_m(), v_mps: passage.v_mps };
-                let cost = Cost::Single(single);
-                let (from, to) = cost.bracket_s();
-                let time_s = root(|t| cost.slope(t), from, to);
+                let time_s = best_s(&Cost::Single(single));
                 (time_s, single.exit_mps(time_s))
             });
             self.rows.push(row);
