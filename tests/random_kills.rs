@@ -43,7 +43,7 @@ impl Disturbance {
         let scenario = random.random_range(0..SCENARIOS.len());
         let most = SCENARIOS[scenario].2;
         let mut arguments = vec!["--wait".to_owned()];
-        arguments.push(["hybrid", "block"].choose(&mut random).unwrap().to_string());
+        arguments.push(["adaptive", "hybrid", "block"].choose(&mut random).unwrap().to_string());
         for role in ["--coord-procs", "--ctrl-procs"] {
             arguments.extend([role.to_owned(), random.random_range(1..=most).to_string()]);
         }
