@@ -50,13 +50,18 @@ impl Peers {
     }
 }
 
-/// Whether a process exists and is not merely waiting to be reaped.
+/// Whether a process exists and is not merely waiting to be reaped. Its first thread may be a zombie while others run,
+/// or have yet to let go of what it has locked.
 pub(super) fn is_alive(process_id: u32) -> bool {
     // The id may come from anybody; what no process can have means a group elsewhere.
     let Some(id) = i32::try_from(process_id).ok().filter(|id| *id > 0) else { return false };
     match std::fs::read_to_string(format!("/proc/{process_id}/stat")) {
         // The state follows the command name, which is in parentheses and may hold any character.
-        Ok(stat) => stat.rsplit(')').next().is_some_and(|rest| !rest.trim_start().starts_with(['Z', 'X'])),
+        Ok(stat) => {
+            let threads = || std::fs::read_dir(format!("/proc/{process_id}/task")).map_or(0, Iterator::count);
+            let runs = |rest: &str| !rest.trim_start().starts_with(['Z', 'X']);
+            stat.rsplit(')').next().is_some_and(runs) || threads() > 1
+        }
         Err(_) => rustix::process::Pid::from_raw(id)
             .is_some_and(|pid| rustix::process::test_kill_process(pid).is_ok()),
     }
@@ -108,5 +113,22 @@ mod tests {
         }
         child.wait().expect("the child can be reaped");
         assert!(!is_alive(child.id()));
+    }
+
+    #[test]
+    fn a_process_whose_first_thread_has_ended_is_there_while_another_runs() {
+        let program = "import ctypes, threading, time
+threading.Thread(target=time.sleep, args=(600,)).start()
+ctypes.CDLL(None).pthread_exit(None)";
+        let mut child =
+            std::process::Command::new("python3").args(["-c", program]).spawn().expect("there is Python");
+        let id = child.id();
+        while !stat(id).expect("it has not been reaped").starts_with('Z') {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        assert!(is_alive(id));
+        child.kill().expect("the child is ours");
+        child.wait().expect("the child can be reaped");
+        assert!(!is_alive(id));
     }
 }

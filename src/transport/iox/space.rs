@@ -109,7 +109,6 @@ impl RunSpace {
     pub fn enter(run: &RunName) -> Result<RunSpace, SpaceError> {
         // Everything iceoryx2 reports comes back as an error value, which says it better.
         set_log_level(LogLevel::Fatal);
-        // Locked until there is a node, so that nobody who leaves takes the directory away meanwhile.
         let Some(base) = Base::open(true)? else { unreachable!("a missing one is made") };
         let (place, begins) = match base.find(run) {
             Found::Run(place) if !place.is_dead() => (place, false),
@@ -121,6 +120,8 @@ impl RunSpace {
             Found::Foreign(problem) => return Err(foreign(&base, run, &problem)),
         };
         let presence = Some(place.enter()?);
+        // Nobody takes away the directory of a run somebody is in; the next need not wait for what takes longer.
+        drop(base);
         let config = config(&place)?;
         let node = within_bounds(&format!("coming into run {run}"), || {
             let node = NodeBuilder::new()
@@ -132,7 +133,6 @@ impl RunSpace {
             node.try_cleanup_dead_nodes();
             Ok(node)
         })?;
-        drop(base);
         if begins {
             sweep_dead_runs();
         }
@@ -337,11 +337,13 @@ fn foreign(base: &Base, run: &RunName, problem: &str) -> SpaceError {
 }
 
 /// Takes from other users what iceoryx2 lets them have: it creates one file per prefix, a counter of nodes,
-/// for everybody to write. All others it creates for this user alone.
+/// for everybody to write. All others it creates for this user alone. While it is being written it is for nobody
+/// to read, by which others know that it is not complete: then it is left to who writes it.
 fn close_to_others(prefix: &str) {
     use std::os::unix::fs::PermissionsExt;
+    let is_open = |path: &Path| std::fs::metadata(path).is_ok_and(|file| file.mode() & 0o077 != 0);
     for path in shared_memory(prefix) {
-        if path.extension().is_some_and(|extension| extension == "global_mgmt") {
+        if path.extension().is_some_and(|extension| extension == "global_mgmt") && is_open(&path) {
             let _ = std::fs::set_permissions(path, std::fs::Permissions::from_mode(0o600));
         }
     }
