@@ -8,7 +8,7 @@ use common::unique_name;
 use control_zones::transport::iox::{IoxInbox, IoxOutbox, RunName, RunSpace, Service, ServiceLimits};
 use control_zones::transport::memory::{MemoryInbox, MemoryOutbox, MemoryService};
 use control_zones::transport::{Backlog, Frame, Inbox, Loan, Outbox, TransportError};
-use ipc_schemas::{FrameHeader, VehicleCommand, schema_hash};
+use ipc_schemas::{FrameHeader, Role, VehicleCommand, schema_hash};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// Frames are laid out for this many records at first.
@@ -393,4 +393,32 @@ fn the_space_of_the_last_to_leave_is_empty() {
     drop((outbox, opened, other));
     assert_eq!(common::files(None, &name), Vec::<std::path::PathBuf>::new());
     assert!(RunSpace::sweep(&run).unwrap());
+}
+
+#[test]
+fn ringing_is_left_to_others_while_any_of_them_is_awake() {
+    let run: RunName = unique_name("deputies").parse().unwrap();
+    let space = RunSpace::enter(&run).unwrap();
+    let limits = ServiceLimits { publishers: 1, subscribers: 1, nodes: 1, backlog: Backlog::STEPS };
+    let service = space.create::<VehicleCommand>(SERVICE, limits).unwrap();
+    let bells = space.create_bells().unwrap();
+    let receiver = bells.bell(Role::Coordinator, 0);
+    let deputies = [0, 1].map(|i| bells.bell(Role::Controller, i));
+    let mut outbox = service
+        .outbox(EXPECTED)
+        .unwrap()
+        .ringing([bells.rope(Role::Coordinator, 0)])
+        .leaving_it_to([0, 1].map(|i| bells.rope(Role::Controller, i)));
+    let mut is_rung = |step| {
+        receiver.lie_down();
+        send(&mut outbox, step, 1).unwrap();
+        receiver.sleep(std::time::Duration::from_millis(1)).is_some()
+    };
+    assert!(!is_rung(1));
+    deputies[0].lie_down();
+    assert!(!is_rung(2));
+    deputies[1].lie_down();
+    assert!(is_rung(3));
+    deputies[0].stay_awake();
+    assert!(!is_rung(4));
 }

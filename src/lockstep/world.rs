@@ -173,7 +173,12 @@ where
 
     /// Whether a coordinator acted in the step published last.
     pub fn was_event(&self) -> bool {
-        self.header.coordinators_acting != 0
+        self.coordinators_acting() != 0
+    }
+
+    /// The coordinators that act in the step published last.
+    pub fn coordinators_acting(&self) -> u64 {
+        self.header.coordinators_acting
     }
 
     /// Whether the next thing to do is to publish a step's state.

@@ -16,6 +16,8 @@ use std::time::Duration;
 const LONGEST_SLEEP: Duration = Duration::from_millis(5);
 /// A participant that has sent a bad frame may take this long to send a good one.
 const SECOND_CHANCE: Duration = Duration::from_secs(1);
+/// Coordinators are woken by the controllers that wait for them; by the world too when that takes longer.
+const WAKE_AFTER: Duration = Duration::from_micros(20);
 /// Newcomers are seen to when a wait takes longer than this.
 const ATTEND_AFTER: Duration = Duration::from_millis(1);
 
@@ -94,6 +96,9 @@ impl House {
         }
         if driver.expects_requests() {
             self.attend(driver, waiter)?;
+        }
+        if waiter.waited() >= WAKE_AFTER {
+            waiter.wake(driver.coordinators_acting());
         }
         if waiter.waited() >= ATTEND_AFTER {
             self.attend(driver, waiter)?;

@@ -1,6 +1,6 @@
 //! The coordinator and controller processes.
 
-use super::services::{controller_ropes, expected_vehicles, rope_of};
+use super::services::{controller_ropes, coordinator_ropes, expected_vehicles, rope_of};
 use super::wait::Participant;
 use super::{Attachment, Held, Joining, Patience, ProcessError, Settling, StopFlag, WaitMode, Waiter};
 use crate::control::ControllerPool;
@@ -147,6 +147,13 @@ impl<'a> Joined<'a> {
         let hot_processes = 1 + attachment.reply.controllers as usize;
         let patience = Patience::of(self.wait, self.role, hot_processes, timeout);
         let waiter = Waiter::new(patience, self.bell, stop.clone(), attachment.world());
+        let waiter = match self.role {
+            Role::Controller => {
+                let coordinators = attachment.reply.coordinators;
+                waiter.waking(coordinator_ropes(&attachment.bells, self.wait, coordinators))
+            }
+            _ => waiter,
+        };
         // The others may come as late as the world waits for them; whoever stops waiting first is not to be this one.
         let mut waiter = waiter.begin_within(joining.timeout + peer_timeout);
         let end = waiter.drive(&mut driver, || attachment.catch_up(stop));

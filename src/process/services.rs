@@ -9,6 +9,7 @@ use crate::transport::iox::{
 };
 use crate::transport::{Backlog, Loan, Outbox, Slots, TransportError};
 use ipc_schemas::{self as frames, Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
+use std::ops::Range;
 
 /// The world's ends of the services.
 pub(super) type Ports = WorldPorts<
@@ -133,7 +134,11 @@ impl Services {
                 .coordinator_states
                 .iter()
                 .zip(0..)
-                .map(|(s, i)| Ok(s.outbox(expected)?.ringing(rope_of(bells, wait, Role::Coordinator, i))))
+                .map(|(s, i)| {
+                    let outbox = s.outbox(expected)?.ringing(rope_of(bells, wait, Role::Coordinator, i));
+                    let deputies = controllers_that_wake(scenario, wait, self.controllers);
+                    Ok(outbox.leaving_it_to(deputies.map(|i| bells.rope(Role::Controller, i))))
+                })
                 .collect::<Result<_, SpaceError>>()?,
             command: self.command.inbox()?,
             coordination: if self.keeps { Some(self.coordination.inbox()?) } else { None },
@@ -150,6 +155,20 @@ impl Services {
 pub(super) fn controller_ropes(bells: &Bells, wait: WaitMode, controllers: u32) -> Vec<BellRope> {
     let count = if wait.has_bell(Role::Controller) { controllers } else { 0 };
     (0..count).map(|i| bells.rope(Role::Controller, i)).collect()
+}
+
+/// The controllers that wake the coordinators they wait for, when awake: on the core that such a controller is about to
+/// give away a waking costs a fraction of what it costs across cores. All of them, or with plug-ins, which ring no
+/// bells, none; none where everybody sleeps, for then it is better woken before them.
+fn controllers_that_wake(scenario: &Scenario, wait: WaitMode, controllers: u32) -> Range<u32> {
+    let do_they = matches!(wait, WaitMode::Adaptive | WaitMode::Hybrid) && scenario.plugins.is_empty();
+    0..if do_they { controllers } else { 0 }
+}
+
+/// The ropes of all coordinators' bells, when they sleep under this mode.
+pub(super) fn coordinator_ropes(bells: &Bells, wait: WaitMode, coordinators: u32) -> Vec<BellRope> {
+    let count = if wait.has_bell(Role::Coordinator) { coordinators } else { 0 };
+    (0..count).map(|i| bells.rope(Role::Coordinator, i)).collect()
 }
 
 /// The rope of one process's bell, when those of its role sleep under this mode.

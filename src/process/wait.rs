@@ -8,7 +8,7 @@ use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
 use crate::own_time::LONGEST_PAUSE;
 use crate::scenario::ControllerNames;
 use crate::trace::{self, Phase};
-use crate::transport::iox::{Bell, monotonic_ns};
+use crate::transport::iox::{Bell, BellRope, monotonic_ns};
 use ipc_schemas::{Role, WAITING_ADAPTIVE, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
 use std::io::Read;
 use std::time::{Duration, Instant};
@@ -157,6 +157,8 @@ pub trait Participant {
 pub struct Waiter {
     patience: Patience,
     bell: Option<Bell>,
+    /// The bells of coordinators, by index.
+    coordinators: Vec<BellRope>,
     /// What to do until the next look; nothing is known yet at the beginning of a wait.
     advice: Option<Advice>,
     /// The bell has been told that this process is about to sleep.
@@ -188,6 +190,7 @@ impl Waiter {
         Waiter {
             patience,
             bell,
+            coordinators: Vec::new(),
             advice: None,
             lies_down: false,
             stop,
@@ -206,6 +209,18 @@ impl Waiter {
     pub fn begin_within(mut self, bound: Duration) -> Waiter {
         self.first = Some(bound);
         self
+    }
+
+    /// Wakes the coordinators it waits for, by these ropes of theirs.
+    pub fn waking(mut self, coordinators: Vec<BellRope>) -> Waiter {
+        self.coordinators = coordinators;
+        self
+    }
+
+    /// Wakes the coordinators of this mask that sleep.
+    pub fn wake(&self, mask: u64) {
+        let meant = self.coordinators.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1);
+        meant.for_each(|(_, rope)| rope.ring());
     }
 
     /// Something came.
@@ -341,6 +356,10 @@ impl Waiter {
                 Progress::Advanced => self.reset(),
                 Progress::Waiting(awaited) => {
                     trace::begin(Phase::Wait, awaited.step);
+                    // About to give its core away: now they are woken at the least cost.
+                    if self.polls == 0 && awaited.role == Role::Coordinator {
+                        self.wake(awaited.missing);
+                    }
                     self.wait(awaited, None)?;
                 }
                 Progress::Behind => {

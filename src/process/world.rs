@@ -7,7 +7,7 @@ use super::outcome::{Events, History, Outcome, StepMeter};
 use super::pace::Pacer;
 use super::peers::is_alive;
 use super::placement::number_of_cores;
-use super::services::{Driver, Services, expected_vehicles};
+use super::services::{Driver, Services, coordinator_ropes, expected_vehicles};
 use super::viewing::{Steering, Viewing};
 use super::{Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
@@ -210,7 +210,8 @@ pub fn run_world(
         driver.observe(Box::new(observed));
     }
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
-    let mut waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
+    let waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
+    let mut waiter = waiter.waking(coordinator_ropes(&bells, wait, coordinators));
     waiter.call(driver.names());
     for Peer { role, index, process_id } in reception.peers().0 {
         driver.seat(role, index, Seat::new(0, process_id));
@@ -243,6 +244,8 @@ pub fn run_world(
         }
         match driver.advance().map_err(|error| waiter.explain(error))? {
             Progress::Finished => {
+                // Nobody else waits for them any more.
+                waiter.wake(u64::MAX);
                 history.punctuality = house.pacer.report(&driver.names());
                 history.refused = driver.refused();
                 history.late_frames = driver.late_frames();

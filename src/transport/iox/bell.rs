@@ -148,6 +148,11 @@ impl Bell {
 }
 
 impl BellRope {
+    /// Whether the sleeper sleeps, or is about to, as far as can be seen without a fence.
+    pub fn is_asleep(&self) -> bool {
+        self.0.word().load(Ordering::Relaxed) != AWAKE
+    }
+
     /// Wakes the sleeper, if it sleeps, after something was sent to it. Several ropes are pulled faster by
     /// `ring_all`.
     pub fn ring(&self) {

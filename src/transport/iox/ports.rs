@@ -22,6 +22,8 @@ pub struct IoxOutbox<R: Record> {
     service: String,
     publisher: Publisher<ipc::Service, [R], FrameHeader>,
     bells: Vec<BellRope>,
+    /// Who rings them instead, when awake.
+    deputies: Vec<BellRope>,
     /// Knows the ports of the service.
     factory: Rc<Factory<R>>,
 }
@@ -32,12 +34,18 @@ impl<R: Record> IoxOutbox<R> {
         publisher: Publisher<ipc::Service, [R], FrameHeader>,
         factory: Rc<Factory<R>>,
     ) -> Self {
-        IoxOutbox { service, publisher, bells: Vec::new(), factory }
+        IoxOutbox { service, publisher, bells: Vec::new(), deputies: Vec::new(), factory }
     }
 
     /// Rings these bells after every send.
     pub fn ringing(mut self, bells: impl IntoIterator<Item = BellRope>) -> Self {
         self.bells.extend(bells);
+        self
+    }
+
+    /// Leaves the ringing to these while any of them is awake.
+    pub fn leaving_it_to(mut self, deputies: impl IntoIterator<Item = BellRope>) -> Self {
+        self.deputies.extend(deputies);
         self
     }
 }
@@ -64,7 +72,7 @@ impl<R: Record> Outbox<R> for IoxOutbox<R> {
         slots.assert_full();
         // SAFETY: `assert_full` has established that all `count` records have been written.
         let sample = unsafe { sample.assume_init() };
-        Ok(IoxLoan { service: &self.service, sample, bells: &self.bells })
+        Ok(IoxLoan { service: &self.service, sample, bells: &self.bells, deputies: &self.deputies })
     }
 
     fn receivers(&self, visit: &mut dyn FnMut(Option<u32>)) {
@@ -87,6 +95,7 @@ pub struct IoxLoan<'a, R: Record> {
     service: &'a str,
     sample: SampleMut<ipc::Service, [R], FrameHeader>,
     bells: &'a [BellRope],
+    deputies: &'a [BellRope],
 }
 
 impl<R: Record> Loan<R> for IoxLoan<'_, R> {
@@ -100,7 +109,9 @@ impl<R: Record> Loan<R> for IoxLoan<'_, R> {
             service: service.to_owned(),
             reason: format!("{error:?}"),
         })?;
-        ring_all(self.bells);
+        if self.deputies.iter().all(BellRope::is_asleep) {
+            ring_all(self.bells);
+        }
         trace::enter(Phase::Compute);
         Ok(reached)
     }
