@@ -9,7 +9,7 @@ pub mod conflict;
 pub mod control;
 pub mod coordination;
 pub mod encoding;
-mod lanes;
+mod lists;
 pub mod lockstep;
 pub mod own_time;
 pub mod process;

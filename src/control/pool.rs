@@ -8,7 +8,7 @@ use super::law::{Decision, Law, Laws, Partner, Schedule, Situation, Verdict, Wor
 use super::ocbf::Program;
 use super::rows::Row;
 use crate::conflict::Duty;
-use crate::lanes::{AHEAD, Lanes, fetch};
+use crate::lists::{AHEAD, Lists, fetch};
 use crate::scenario::{Scenario, ZoneId};
 use crate::vehicle::Inequality;
 use assigned::{Member, Renewed};
@@ -26,14 +26,14 @@ pub struct ControllerPool {
     kinds: u16,
     zones: Range<ZoneId>,
     /// Lengths of each zone's paths, m.
-    lengths_m: Lanes<f64>,
+    lengths_m: Lists<f64>,
     /// The vehicles of each zone, aligned with its members in the state frame.
-    members: Lanes<Member>,
+    members: Lists<Member>,
     /// Their constraints.
-    constraints: Lanes<Duty>,
+    constraints: Lists<Duty>,
     /// What they are scheduled for, aligned with the members; empty where nobody is, as always under coordinators that
     /// do not schedule.
-    schedules: Lanes<Option<Schedule>>,
+    schedules: Lists<Option<Schedule>>,
     /// Where each zone's slice began in the last frame: about where it begins in the next.
     starts: Vec<usize>,
     /// A zone's new members and constraints while they are put together; kept for their allocations.
@@ -87,10 +87,10 @@ impl ControllerPool {
     /// A pool for the given zones.
     pub fn new(scenario: Arc<Scenario>, zones: Range<ZoneId>) -> ControllerPool {
         let count = zones.len();
-        let mut lengths_m = Lanes::new(count);
-        for (lane, zone) in zones.clone().enumerate() {
+        let mut lengths_m = Lists::new(count);
+        for (place, zone) in zones.clone().enumerate() {
             let paths = &scenario.network.zones[zone as usize].paths;
-            paths.iter().for_each(|path| lengths_m.push(lane, path.length_m));
+            paths.iter().for_each(|path| lengths_m.push(place, path.length_m));
         }
         let plugged = scenario.plugins.iter().flat_map(|p| p.paths.iter().copied());
         let mut kinds: Vec<crate::scenario::LawKind> = Vec::new();
@@ -109,9 +109,9 @@ impl ControllerPool {
             kinds: scenario.fleet.len() as u16,
             v_max_mps: scenario.vehicle.v_max_mps,
             lengths_m,
-            members: Lanes::new(count),
-            constraints: Lanes::new(count),
-            schedules: Lanes::new(count),
+            members: Lists::new(count),
+            constraints: Lists::new(count),
+            schedules: Lists::new(count),
             starts: vec![0; count],
             renewed: Renewed::default(),
             plugged: plugged.filter(|(zone, _)| zones.contains(zone)).collect(),
@@ -135,16 +135,16 @@ impl ControllerPool {
         for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
             let zone = group[0].zone;
             if self.zones.contains(&zone) {
-                let lane = (zone - self.zones.start) as usize;
-                let expected = self.starts[lane].wrapping_add(drift);
+                let place = (zone - self.zones.start) as usize;
+                let expected = self.starts[place].wrapping_add(drift);
                 let from = first_of(states, zone, expected);
-                drift = from.wrapping_sub(self.starts[lane]);
+                drift = from.wrapping_sub(self.starts[place]);
                 let slice = states[from..].chunk_by(|a, b| a.zone == b.zone).next().unwrap_or(&[]);
                 let slice = if slice.first().is_some_and(|s| s.zone == zone) { slice } else { &[] };
-                self.renewed.assign(zone, slice, group, &self.members[lane], self.v_max_mps)?;
-                self.members.set(lane, &self.renewed.members);
-                self.constraints.set(lane, &self.renewed.constraints);
-                self.schedules.set(lane, &self.renewed.schedules);
+                self.renewed.assign(zone, slice, group, &self.members[place], self.v_max_mps)?;
+                self.members.set(place, &self.renewed.members);
+                self.constraints.set(place, &self.renewed.constraints);
+                self.schedules.set(place, &self.renewed.schedules);
             }
         }
         Ok(())
@@ -162,10 +162,10 @@ impl ControllerPool {
         commands: &[VehicleCommand],
         in_force: &[Assignment],
     ) -> Result<(), PoolError> {
-        for lane in 0..self.zones.len() {
-            self.members.set(lane, &[]);
-            self.constraints.set(lane, &[]);
-            self.schedules.set(lane, &[]);
+        for place in 0..self.zones.len() {
+            self.members.set(place, &[]);
+            self.constraints.set(place, &[]);
+            self.schedules.set(place, &[]);
         }
         for group in commands.chunk_by(|a, b| a.zone == b.zone) {
             if self.zones.contains(&group[0].zone) {
@@ -226,19 +226,19 @@ impl ControllerPool {
         let (mut start, end) = (range.start, range.end);
         for slice in states[range].chunk_by(|a, b| a.zone == b.zone) {
             let zone = slice[0].zone;
-            let lane = (zone - self.zones.start) as usize;
-            self.starts[lane] = start;
+            let place = (zone - self.zones.start) as usize;
+            self.starts[place] = start;
             start += slice.len();
             let ahead = (start + RECORDS_AHEAD).min(end);
             fetch(&states[ahead..(ahead + slice.len()).min(end)]);
-            self.members.fetch(lane + AHEAD);
-            self.constraints.fetch(lane + AHEAD);
+            self.members.fetch(place + AHEAD);
+            self.constraints.fetch(place + AHEAD);
             let left = slice.iter().take_while(|state| state.has_left()).count();
             let present = &slice[left..];
             if present.is_empty() {
                 continue;
             }
-            let members = &mut self.members[lane];
+            let members = &mut self.members[place];
             let unassigned = PoolError::Unassigned { zone, present: present.len(), assigned: members.len() };
             // No branch per vehicle: that all fit is what one expects.
             let others =
@@ -251,13 +251,13 @@ impl ControllerPool {
                 slice,
                 present,
                 members,
-                lengths_m: &self.lengths_m[lane],
-                constraints: &self.constraints[lane],
-                schedules: &self.schedules[lane],
+                lengths_m: &self.lengths_m[place],
+                constraints: &self.constraints[place],
+                schedules: &self.schedules[place],
                 plugged: &self.plugged,
                 kinds: self.kinds,
             };
-            with(&self.laws[usize::from(self.law_of[lane])], scene);
+            with(&self.laws[usize::from(self.law_of[place])], scene);
         }
         Ok(())
     }

@@ -9,7 +9,7 @@
 
 use super::car::Car;
 use super::metrics::FaultCounts;
-use crate::lanes::Lanes;
+use crate::lists::Lists;
 use crate::scenario::{CommandFaults, Faults as Plan, Noise, Scenario, Scope, SensorKind, Span, ZoneId};
 use ipc_schemas::{VERDICT_FALLBACK, VERDICT_HELD, VehicleState};
 use std::collections::{BTreeMap, VecDeque};
@@ -107,9 +107,9 @@ impl Faults {
         self.said.clear();
         self.starts.clear();
         for record in truth {
-            let lane = (record.zone as usize).min(self.zones);
-            if self.starts.len() <= lane {
-                self.starts.resize(lane + 1, self.said.len());
+            let place = (record.zone as usize).min(self.zones);
+            if self.starts.len() <= place {
+                self.starts.resize(place + 1, self.said.len());
             }
             let sample = self.sample(step, time_s, &record);
             self.said.push(sample);
@@ -182,7 +182,7 @@ impl Faults {
         step: u64,
         time_s: f64,
         limits: Limits,
-        cars: &mut Lanes<Car>,
+        cars: &mut Lists<Car>,
         first: impl Fn(usize) -> usize,
     ) {
         for zone in 0..self.zones {

@@ -12,7 +12,7 @@ use super::metrics::{ShieldRow, ShieldSummary};
 use super::owed::Standing;
 use super::role::World;
 use crate::conflict::DutyKind;
-use crate::lanes::AHEAD;
+use crate::lists::AHEAD;
 use crate::scenario::{Drivers, Scenario, ShieldMode};
 use crate::shield::{Partner, Row, Shield};
 use crate::vehicle::Held;

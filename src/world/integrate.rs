@@ -8,7 +8,7 @@ use super::owed::{Owed, Standing};
 use super::role::{Scratch, World};
 use super::way::Ways;
 use crate::conflict::DutyKind;
-use crate::lanes::AHEAD;
+use crate::lists::AHEAD;
 use crate::scenario::{Downstream, EntryRule, Road, Scenario, ZoneId};
 use crate::vehicle::Held;
 use ipc_schemas::{VERDICT_FE, VERDICT_INFEASIBLE};

@@ -9,7 +9,7 @@
 use super::car::Car;
 use super::role::World;
 use crate::conflict::{Conflicts, PointKind, Run};
-use crate::lanes::Lanes;
+use crate::lists::Lists;
 use crate::scenario::{Scenario, VehicleParams};
 use crate::vehicle::Held;
 use serde::{Deserialize, Serialize};
@@ -51,7 +51,7 @@ pub(super) struct Overlaps {
     pairs: BTreeSet<[u32; 2]>,
     /// Vehicles whose bodies still reach back into a zone in which others count as the last that left: in the
     /// zone's coordinate.
-    tails: Lanes<Car>,
+    tails: Lists<Car>,
     /// Least position of those seen so far from each entrance of a zone, m.
     least_m: Vec<f64>,
     /// Stretches that two vehicles share; kept for its allocation.
@@ -81,7 +81,7 @@ impl Overlaps {
         Overlaps {
             summary: OverlapSummary::default(),
             pairs: BTreeSet::new(),
-            tails: Lanes::new(zones),
+            tails: Lists::new(zones),
             least_m: Vec::new(),
             runs: Vec::new(),
         }

@@ -11,7 +11,7 @@ use super::overlap::Overlaps;
 use super::owed::{Order, Owed};
 use super::standstill::Standstills;
 use crate::conflict::Conflicts;
-use crate::lanes::{AHEAD, Lanes};
+use crate::lists::{AHEAD, Lists};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::scenario::{Scenario, VehicleParams, ZoneId};
 use crate::vehicle::Held;
@@ -32,16 +32,16 @@ pub struct World {
     pub(super) step: u64,
     /// The paper's S(t) of each zone: those that left last (see [`ZoneState`]), and the members in order of
     /// entry.
-    pub(super) cars: Lanes<Car>,
+    pub(super) cars: Lists<Car>,
     pub(super) zones: Vec<ZoneState>,
     /// Those that left last, of all zones.
     pub(super) left: usize,
     pub(super) conflicts: Vec<Conflicts>,
     /// Lengths of each zone's paths, m.
-    pub(super) lengths_m: Lanes<f64>,
+    pub(super) lengths_m: Lists<f64>,
     /// The duties of each zone's members, car by car, and the order in which members pass: indices of cars.
-    pub(super) owed: Lanes<Owed>,
-    pub(super) order: Lanes<u32>,
+    pub(super) owed: Lists<Owed>,
+    pub(super) order: Lists<u32>,
     /// Of zones that are not served in order of entry.
     pub(super) orders: BTreeMap<ZoneId, Order>,
     pub(super) links: Links,
@@ -67,7 +67,7 @@ pub struct World {
     state_hash: u64,
     /// Zones of each coordinator process, their neighbour processes, and who had an event.
     coordinators: Vec<CoordinatorShare>,
-    neighbours: Lanes<ZoneId>,
+    neighbours: Lists<ZoneId>,
     /// Zones to which their neighbours' events of the step before are new.
     told: Vec<ZoneId>,
     /// Zones that act in the present step, ascending.
@@ -144,7 +144,7 @@ impl World {
                 neighbours,
             })
             .collect();
-        let (mut lengths_m, mut neighbours) = (Lanes::new(zones), Lanes::new(zones));
+        let (mut lengths_m, mut neighbours) = (Lists::new(zones), Lists::new(zones));
         for (i, zone) in network.zones.iter().enumerate() {
             zone.paths.iter().for_each(|path| lengths_m.push(i, path.length_m));
             network.neighbours(i as ZoneId).for_each(|n| neighbours.push(i, n));
@@ -152,13 +152,13 @@ impl World {
         let kinds: Vec<VehicleParams> = scenario.fleet.iter().map(|kind| kind.vehicle).collect();
         World {
             step: 0,
-            cars: Lanes::new(zones),
+            cars: Lists::new(zones),
             zones: vec![ZoneState::default(); zones],
             left: 0,
             conflicts: Conflicts::of_all(network),
             lengths_m,
-            owed: Lanes::new(zones),
-            order: Lanes::new(zones),
+            owed: Lists::new(zones),
+            order: Lists::new(zones),
             orders: BTreeMap::new(),
             links: Links::of(network),
             reach_m: kinds.iter().map(|k| k.reaction_time_s * k.v_max_mps).fold(0.0, f64::max),
