@@ -217,7 +217,8 @@ impl Duties {
                     until_m,
                 });
             });
-            if conflicts.has_one_exit() && covered.contains(&(f64::NEG_INFINITY, f64::INFINITY, at)) {
+            // Where nobody turns off, whoever is further ahead is behind this one's back for good.
+            if conflicts.goes_on_together() && covered.contains(&(f64::NEG_INFINITY, f64::INFINITY, at)) {
                 break;
             }
         }

@@ -50,6 +50,7 @@ pub struct Conflicts {
     points: Vec<Point>,
     paths: Vec<PathConflicts>,
     exits: Vec<Onward>,
+    goes_on_together: bool,
 }
 
 #[derive(Clone, Debug)]
@@ -93,7 +94,12 @@ impl Conflicts {
             uses: Vec::new(),
             shared: Vec::new(),
         });
-        let mut conflicts = Conflicts { points: Vec::new(), paths: paths.collect(), exits: Vec::new() };
+        let mut conflicts = Conflicts {
+            points: Vec::new(),
+            paths: paths.collect(),
+            exits: Vec::new(),
+            goes_on_together: false,
+        };
         conflicts.exits = zone
             .exits
             .iter()
@@ -118,6 +124,11 @@ impl Conflicts {
             };
             conflicts.paths[own].ends_among_others = path.shared.iter().any(ends_with);
         }
+        let is_one_way = |exit: &Onward| exit.paths.iter().filter(|path| !path.is_empty()).count() <= 1;
+        let mut shared = conflicts.paths.iter().flat_map(|path| &path.shared);
+        conflicts.goes_on_together = conflicts.exits.len() == 1
+            && conflicts.exits.iter().all(is_one_way)
+            && shared.all(|(_, run)| run.to_m == f64::INFINITY);
         for path in &mut conflicts.paths {
             path.uses.sort_by(|a, b| a.at_m.total_cmp(&b.at_m));
             path.meets_from_m = path.uses.first().map_or(f64::INFINITY, |first| first.at_m);
@@ -152,9 +163,9 @@ impl Conflicts {
         self.paths[path as usize].exit
     }
 
-    /// Whether all paths leave by one exit.
-    pub fn has_one_exit(&self) -> bool {
-        self.exits.len() == 1
+    /// Whether vehicles that are on one lane stay on one lane, to the zone's exit and through the next zone.
+    pub fn goes_on_together(&self) -> bool {
+        self.goes_on_together
     }
 
     /// Where a path first meets others than those of its own lane, m; infinite when it does not.

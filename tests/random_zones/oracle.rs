@@ -10,6 +10,9 @@ use std::collections::{HashMap, HashSet};
 const TOLERANCE_M: f64 = 1e-4;
 /// A vehicle that has less than this when it enters is not relied on: sampling errs by less.
 const CLEARLY_SAFE_M: f64 = 0.01;
+/// Whoever comes to stand this close before a place, or at it, has not passed it yet, m: positions are rounded, and a
+/// vehicle may go on to the place itself where it is admitted by the end of the step.
+const STANDS_AT_M: f64 = 1e-9;
 /// Instants within a step at which margins are looked at.
 const SAMPLES: u32 = 8;
 
@@ -57,8 +60,14 @@ impl Motion {
         (self.x_m + self.v_mps * s + 0.5 * self.u_mps2 * s * s, (self.v_mps + self.u_mps2 * s).max(0.0))
     }
 
+    /// Where it has passed a place for good.
+    fn behind_m(&self, place_m: f64, within_s: f64) -> f64 {
+        if self.at(within_s).1 < 1e-9 { place_m + STANDS_AT_M } else { place_m }
+    }
+
     /// When it reaches a place, by bisection.
     fn reaches(&self, place_m: f64, within_s: f64) -> Option<f64> {
+        let place_m = self.behind_m(place_m, within_s);
         if self.x_m >= place_m || self.at(within_s).0 < place_m {
             return None;
         }
@@ -295,10 +304,11 @@ impl<'a> Oracle<'a> {
         let phi_s = self.scenario.fleet[i.kind].vehicle.reaction_time_s;
         let body_m = self.scenario.fleet[j.kind].vehicle.length_m;
         let gap_m = self.gap_m(i.kind, j.kind);
+        let passed_m = own.behind_m(from_m, within_s);
         let margin_at = |s: f64| {
             let ((x_m, v_mps), (y_m, _)) = (own.at(s), other.at(s));
             let y_m = y_m + shift_m;
-            let is_on = (x_m >= from_m || from_m == 0.0) && x_m < to_m && y_m < to_m + body_m;
+            let is_on = (x_m >= passed_m || from_m == 0.0) && x_m < to_m && y_m < to_m + body_m;
             if is_on { y_m - x_m - phi_s * v_mps - gap_m } else { f64::INFINITY }
         };
         let mut least_m = f64::INFINITY;
