@@ -287,6 +287,26 @@ fn traffic_never_locks_up() {
     }
 }
 
+/// Behind a gate nobody is ever unsafe, and bodies never touch, where paths part either.
+#[test]
+fn a_gate_keeps_bodies_apart_in_a_full_roundabout() {
+    for order in [PassingOrder::Fifo, PassingOrder::PerPoint] {
+        let mut scenario = (*busy("roundabout", "on", 700.0, 300)).clone();
+        scenario.network.roads.iter_mut().for_each(|road| road.entry = EntryRule::Viable);
+        scenario.network.zones.iter_mut().for_each(|zone| zone.order = order);
+        let summary = built_in(&Arc::new(scenario));
+        let ShieldRow { lost, began_unsafe, .. } = summary.shield.controllers[0];
+        assert_eq!((summary.departed, summary.waiting), (300, 0), "{order:?}");
+        assert_eq!(
+            (lost, began_unsafe, summary.overlaps.pairs),
+            (0, 0, 0),
+            "{order:?}: {:?}",
+            summary.overlaps
+        );
+        assert!(summary.held_arrivals > 100, "{order:?}: it is not full");
+    }
+}
+
 /// However the roles are shared out.
 #[test]
 fn one_hash_where_paths_cross() {

@@ -98,18 +98,25 @@ impl Overlaps {
         }
     }
 
-    /// Compares two vehicles on one way from an instant of the step on; `shift_m` expresses the second's position in
-    /// the first's coordinate.
-    fn compare(&mut self, look: Look<'_>, a: Body<'_>, b: Body<'_>, shift_m: f64, from_s: f64) {
+    /// Compares two vehicles while they are on one way, s from the step's beginning; `shift_m` expresses the second's
+    /// position in the first's coordinate.
+    fn compare(
+        &mut self,
+        look: Look<'_>,
+        a: Body<'_>,
+        b: Body<'_>,
+        shift_m: f64,
+        (from_s, to_s): (f64, f64),
+    ) {
         // What counts is the body of the one ahead.
         let b_leads = b.motion.position_m(from_s) + shift_m >= a.motion.position_m(from_s);
         let whole_m = if b_leads { b.length_m } else { a.length_m };
         let body_m = whole_m - TOLERANCE_M;
-        let (a_to_m, b_to_m) = (a.motion.position_m(look.dt_s), b.motion.position_m(look.dt_s) + shift_m);
+        let (a_to_m, b_to_m) = (a.motion.position_m(to_s), b.motion.position_m(to_s) + shift_m);
         if b.motion.x0_m + shift_m - body_m >= a_to_m || a.motion.x0_m - body_m >= b_to_m {
             return;
         }
-        let (time_s, least_m) = a.motion.time_within(b.motion, shift_m, body_m, (from_s, look.dt_s));
+        let (time_s, least_m) = a.motion.time_within(b.motion, shift_m, body_m, (from_s, to_s));
         if least_m >= body_m {
             return;
         }
@@ -213,7 +220,7 @@ impl World {
             let to_m = link_car.held.position_m(dt_s);
             if least_m - self.longest_m < to_m {
                 for other in &cars[..i] {
-                    self.overlaps.compare(look, own, look.body(&other.car, &other.held), 0.0, 0.0);
+                    self.overlaps.compare(look, own, look.body(&other.car, &other.held), 0.0, (0.0, dt_s));
                 }
             }
             least_m = least_m.min(link_car.car.x_m);
@@ -226,7 +233,7 @@ impl World {
                     if at < count { self.cars[down][at] } else { self.overlaps.tails[down][at - count] };
                 if paths[other.path as usize].segments[0] == to.segment {
                     let held = other.held();
-                    self.overlaps.compare(look, own, look.body(&other, &held), to.link_m, 0.0);
+                    self.overlaps.compare(look, own, look.body(&other, &held), to.link_m, (0.0, dt_s));
                 }
             }
         }
@@ -286,9 +293,11 @@ fn compare_in_zone(
         };
         let entered = enters_s(motion, run.from_m).zip(enters_s(at, run.other_from_m));
         let shift_m = run.from_m - run.other_from_m;
-        // Where they have parted, both are past the end.
+        // They have parted when both are past the end.
+        let parts_s = |held: &Held, to_m: f64| held.passes_m(to_m, look.dt_s).unwrap_or(look.dt_s);
         if let Some((own_s, other_s)) = entered.filter(|_| car.x_m.min(other.x_m + shift_m) < run.to_m) {
-            overlaps.compare(look, own, theirs, shift_m, own_s.max(other_s));
+            let to_s = parts_s(motion, run.to_m).max(parts_s(at, run.to_m - shift_m));
+            overlaps.compare(look, own, theirs, shift_m, (own_s.max(other_s), to_s));
         }
     }
     overlaps.runs = runs;
