@@ -10,8 +10,10 @@ use control_zones::scenario::{
 use control_zones::world::{World, WorldSummary};
 use ipc_schemas::{NO_ZONE, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, VehicleState};
 use proptest::prelude::*;
+use proptest::test_runner::TestRunner;
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 /// Demand ends after this, s; the run goes on until everybody has left, or for [`END_S`].
 const DEMAND_S: f64 = 90.0;
@@ -28,6 +30,7 @@ const VEHICLE: VehicleParams = VehicleParams {
     standstill_gap_m: 0.0,
 };
 const CASES: u32 = 128;
+const CASES_AT_A_TIME: u32 = 4;
 
 #[derive(Clone, Debug)]
 struct RawZone {
@@ -401,23 +404,40 @@ fn check_order(
     Ok(())
 }
 
-proptest! {
-    #![proptest_config(ProptestConfig { cases: CASES, failure_persistence: None, ..ProptestConfig::default() })]
-
-    #[test]
-    fn a_network(scenario in scenario()) {
-        let scenario = Arc::new(scenario);
-        let (summary, too_fast) = watched_run(&scenario)?;
-        check_order(&scenario, &summary, &too_fast)?;
-        check_floor(&scenario, &summary)?;
-        // Neither running again nor sharing the work out changes a bit.
-        let zones = scenario.network.zones.len() as u32;
-        for (coordinators, controllers) in [(1, 1), (zones, zones.div_ceil(2)), (zones.div_ceil(2), zones)] {
-            prop_assert_eq!(
-                hash_of(&scenario, coordinators, controllers)?,
-                summary.state_hash,
-                "{} coordinators, {} controllers", coordinators, controllers
-            );
-        }
+/// One network: how it is shared out changes no bit, whatever the first run shows.
+fn check(scenario: Scenario) -> Result<(), TestCaseError> {
+    let scenario = Arc::new(scenario);
+    let (summary, too_fast) = watched_run(&scenario)?;
+    check_order(&scenario, &summary, &too_fast)?;
+    check_floor(&scenario, &summary)?;
+    // With one zone these are the same run again.
+    let zones = scenario.network.zones.len() as u32;
+    for (coordinators, controllers) in [(zones, zones.div_ceil(2)), (zones.div_ceil(2), zones)] {
+        prop_assert_eq!(
+            hash_of(&scenario, coordinators, controllers)?,
+            summary.state_hash,
+            "{} coordinators, {} controllers",
+            coordinators,
+            controllers
+        );
     }
+    Ok(())
+}
+
+/// On all cores: whoever is done with some takes the next.
+#[test]
+fn networks() {
+    let left = AtomicU32::new(CASES / CASES_AT_A_TIME);
+    let is_left =
+        || left.fetch_update(Ordering::Relaxed, Ordering::Relaxed, |left| left.checked_sub(1)).is_ok();
+    let config =
+        ProptestConfig { cases: CASES_AT_A_TIME, failure_persistence: None, ..ProptestConfig::default() };
+    let work = || {
+        while is_left() {
+            let result = TestRunner::new(config.clone()).run(&scenario(), check);
+            result.unwrap_or_else(|e| panic!("{e}"));
+        }
+    };
+    let threads = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    std::thread::scope(|scope| (0..threads).for_each(|_| drop(scope.spawn(work))));
 }

@@ -86,14 +86,28 @@ impl Held {
             let curvature = u(other) - u(self);
             let slope = other.speed_mps(start) - self.speed_mps(start);
             let distance = ahead_m(start);
+            let turn_s = start - slope / curvature;
+            let turns = if turn_s > start && turn_s < end { turn_s } else { start };
+            let (a_m, b_m, c_m) = (distance, ahead_m(turns), ahead_m(end));
+            let (lowest, highest) = (a_m.min(b_m).min(c_m), a_m.max(b_m).max(c_m));
+            // Mostly the two are too far apart all the time, or near enough.
+            let (is_away, is_within) = (
+                lowest >= distance_m || highest <= -distance_m,
+                lowest > -distance_m && highest < distance_m && (lowest > 0.0 || highest < 0.0),
+            );
+            if is_away || is_within {
+                least_m = least_m.min(lowest.abs().min(highest.abs()));
+                time_s += if is_within { end - start } else { 0.0 };
+                start = end;
+                continue;
+            }
             // Where it turns, and where it reaches one of these distances.
-            let mut turns = [start, end, start, start, start, start, start, start, start];
+            let mut turns = [start, end, turns, start, start, start, start, start, start];
             let mut put = |at: usize, after_s: f64| {
                 if after_s > 0.0 && start + after_s < end {
                     turns[at] = start + after_s;
                 }
             };
-            put(2, -slope / curvature);
             for (i, level) in [distance_m, 0.0, -distance_m].into_iter().enumerate() {
                 let c = distance - level;
                 let root = (slope * slope - 2.0 * curvature * c).sqrt();

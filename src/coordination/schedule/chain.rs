@@ -57,6 +57,8 @@ pub struct Chain {
     headways: Vec<Headway>,
     alone_s: Vec<f64>,
     earliest_s: Vec<f64>,
+    /// The instants of the round before.
+    before_s: Vec<f64>,
     speeds_mps: Vec<f64>,
     times_s: Vec<f64>,
 }
@@ -82,12 +84,17 @@ impl Chain {
         self.times_s.clear();
         self.times_s.extend(self.alone_s.iter().zip(own).map(|(alone_s, own)| alone_s.max(own.soonest_s())));
         for _ in 0..ROUNDS {
+            self.before_s.clone_from(&self.times_s);
             self.speeds_mps.clear();
             let times = self.times_s.iter();
             self.speeds_mps.extend(costs.iter().zip(own).zip(times).map(|((c, p), &t)| speed(c, p, t)));
             self.separate(passages, duties, known);
-            let Chain { pooling, headways, alone_s, earliest_s, times_s, .. } = self;
+            let Chain { pooling, headways, alone_s, earliest_s, before_s, times_s, .. } = self;
             pooling.minimise(costs, alone_s, earliest_s, headways, times_s);
+            // From the same instants the same would come out again.
+            if times_s == before_s {
+                break;
+            }
         }
         &self.times_s
     }
