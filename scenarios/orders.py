@@ -13,14 +13,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 SEEDS = [1, 2, 3]
-DEMANDS = {"intersection": [100, 250, 400], "roundabout": [150, 250, 400]}
+DEMANDS = {"intersection": [100, 250, 400], "roundabout": [200, 400, 700]}
 HEADER = """# Passing orders where paths cross
 
 Written by `python3 scenarios/orders.py`. Rates are vehicles/h of each road (at the intersection of each of the eight lanes),
 for ten minutes; means over the seeds 1 to 3, each run to its end. Throughput is vehicles that left per hour from the
 start until the last has left. Time is in all zones, from entry to exit of each; delay what it exceeds the
-time at the entry speeds' mean; held are arrivals that had to wait outside, by the end nobody. Infeasible are vehicles that
-met a QP without solution; bounded are commands the shield changed.
+time at the entry speeds' mean; held are arrivals that had to wait outside, by the end nobody, and wait is how long on
+average over all vehicles. Infeasible are vehicles that met a QP without solution; bounded are commands the shield changed.
 
 """
 
@@ -58,6 +58,7 @@ def run(cz, name, rate, order, seed):
         "energy": total("mean_energy") / vehicles,
         "infeasible": sum(z["infeasible_vehicles"] for z in zones),
         "held": summary["held_arrivals"],
+        "wait": total("mean_wait_s") / vehicles,
         "bounded": 100 * shield["bounded"] / max(shield["commands"], 1),
         "overlaps": summary["overlaps"]["pairs"],
         "refused": sum(z["orders_refused"] for z in zones),
@@ -70,7 +71,8 @@ def main():
     columns = [
         ("vehicles", "left", "{:.0f}"), ("throughput [1/h]", "per_hour", "{:.0f}"), ("time [s]", "time", "{:.1f}"),
         ("delay [s]", "delay", "{:.1f}"), ("energy [m²/s³]", "energy", "{:.2f}"),
-        ("infeasible", "infeasible", "{:.1f}"), ("held", "held", "{:.1f}"), ("bounded [%]", "bounded", "{:.2f}"),
+        ("infeasible", "infeasible", "{:.1f}"), ("held", "held", "{:.1f}"),
+        ("wait [s]", "wait", "{:.1f}"), ("bounded [%]", "bounded", "{:.2f}"),
         ("overlaps", "overlaps", "{:.1f}"), ("orders refused", "refused", "{:.1f}"),
     ]  # fmt: skip
     for name, rates in DEMANDS.items():
