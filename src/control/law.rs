@@ -1,7 +1,7 @@
 //! What a law is: from one vehicle's situation and partners to its command.
 //!
-//! A law is one file that implements [`Law`], a variant of [`LawKind`], and a line in
-//! [`Laws`]. It is a pure function of what the frames carry and of what it remembers, and what it remembers travels
+//! A law is one file that implements [`Law`], a variant of [`LawKind`], and three lines at the end of this file: a
+//! variant of [`Laws`], and where it is made and found. It is a pure function of what the frames carry and of what it remembers, and what it remembers travels
 //! in the command frame as words only it understands.
 
 use super::ocbf::Ocbf;
@@ -158,3 +158,14 @@ impl Laws {
         }
     }
 }
+
+/// Does the same with whichever law it is; each in code of its own.
+macro_rules! with_law {
+    ($laws:expr, $law:ident => $does:expr) => {
+        match $laws {
+            $crate::control::law::Laws::Ocbf($law) => $does,
+            $crate::control::law::Laws::Viable($law) => $does,
+        }
+    };
+}
+pub(super) use with_law;

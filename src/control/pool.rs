@@ -4,7 +4,7 @@ mod assigned;
 
 pub use assigned::PoolError;
 
-use super::law::{Decision, Law, Laws, Partner, Schedule, Situation, Verdict, Words};
+use super::law::{Decision, Law, Laws, Partner, Schedule, Situation, Verdict, Words, with_law};
 use super::ocbf::Program;
 use super::rows::Row;
 use crate::conflict::Duty;
@@ -191,10 +191,7 @@ impl ControllerPool {
         states: &[VehicleState],
         mut emit: impl FnMut(VehicleCommand),
     ) -> Result<(), PoolError> {
-        self.visit(time_s, states, |laws, scene| match laws {
-            Laws::Ocbf(law) => scene.decide(law, &mut emit),
-            Laws::Viable(law) => scene.decide(law, &mut emit),
-        })
+        self.visit(time_s, states, |laws, scene| with_law!(laws, law => scene.decide(law, &mut emit)))
     }
 
     /// Shows every program that a law solves in this step, and changes nothing.
@@ -204,13 +201,15 @@ impl ControllerPool {
         states: &[VehicleState],
         mut show: impl FnMut(&Program, Vec<(Inequality, Row)>),
     ) -> Result<(), PoolError> {
-        self.visit(time_s, states, |laws, mut scene| match laws {
-            Laws::Ocbf(law) => scene.each(|_, situation, partners, member| {
-                if let Some((program, rows)) = law.posed(situation, partners, &member.memory) {
-                    show(&program, rows);
-                }
-            }),
-            Laws::Viable(_) => {}
+        self.visit(time_s, states, |laws, mut scene| {
+            // The others solve none.
+            if let Laws::Ocbf(law) = laws {
+                scene.each(|_, situation, partners, member| {
+                    if let Some((program, rows)) = law.posed(situation, partners, &member.memory) {
+                        show(&program, rows);
+                    }
+                });
+            }
         })
     }
 

@@ -240,11 +240,7 @@ pub(in crate::scenario) static COORDINATION: Keys = &[
 // [gate]
 pub(in crate::scenario) static ENTRY: Choice<EntryRule> = Choice {
     name: "entry",
-    words: &[
-        ("free", EntryRule::Free),
-        ("viable", EntryRule::Viable),
-        ("room_to_stop", EntryRule::RoomToStop),
-    ],
+    words: EntryRule::WORDS,
     meaning: "when an arrival may enter behind the last vehicle on its road: once it overlaps nobody, is viable \
               toward it, or can stop behind it",
 };

@@ -160,6 +160,12 @@ pub enum EntryRule {
     RoomToStop,
 }
 
+impl EntryRule {
+    /// The words for them, the default first.
+    pub(super) const WORDS: &'static [(&'static str, EntryRule)] =
+        &[("free", EntryRule::Free), ("viable", EntryRule::Viable), ("room_to_stop", EntryRule::RoomToStop)];
+}
+
 impl LawKind {
     /// The words for them, the default first.
     pub(super) const WORDS: &'static [(&'static str, LawKind)] =
