@@ -206,12 +206,12 @@ fn what_a_controller_refuses_is_in_the_summary_and_by_hand_on_stderr() {
 #[test]
 fn attach_requests_that_contradict_themselves_are_refused_and_end_nothing() {
     let name = unique_name("attach");
-    let start = |program: &str| {
+    let start = |program: &str, more: &[&str]| {
         let mut command = Command::new(program);
-        command.args(["--run", &name]).stdin(Stdio::null()).stdout(Stdio::piped());
+        command.args(["--run", &name]).args(more).stdin(Stdio::null()).stdout(Stdio::piped());
         command.spawn().unwrap()
     };
-    let world = start(env!("CARGO_BIN_EXE_cz-world"));
+    let world = start(env!("CARGO_BIN_EXE_cz-world"), &["paper"]);
     let run: RunName = name.parse().unwrap();
     {
         let space = RunSpace::enter(&run).unwrap();
@@ -245,7 +245,8 @@ fn attach_requests_that_contradict_themselves_are_refused_and_end_nothing() {
             });
         }
     }
-    let mut parts = [env!("CARGO_BIN_EXE_cz-coord"), env!("CARGO_BIN_EXE_cz-ctrl")].map(start);
+    let mut parts =
+        [env!("CARGO_BIN_EXE_cz-coord"), env!("CARGO_BIN_EXE_cz-ctrl")].map(|program| start(program, &[]));
     let output = world.wait_with_output().unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && said.contains("b56ea7e351b4a6a2"), "{said}");

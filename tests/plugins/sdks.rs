@@ -86,7 +86,7 @@ fn pauses_and_catches_up(language: &str, command: &str, policy: &str, arguments:
 
 #[test]
 fn python_ocbf_drives_as_the_built_in_law() {
-    drives_as_the_built_in_law(&[], "merge-2", 1);
+    drives_as_the_built_in_law(&["paper"], "merge-2", 1);
 }
 
 /// Twelve conflict points, and as many duties per vehicle as it has partners at them.

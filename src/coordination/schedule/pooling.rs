@@ -265,7 +265,7 @@ pub fn is_chain(headways: &[Headway]) -> bool {
 const STEPS: u32 = 120;
 /// Width at which a bracket counts as closed, relative to where it is.
 const CLOSED: f64 = 1e-14;
-/// The search ends when it has come to the same place twice, to this share of it.
+/// The search ends when it has come to the same place twice, to this share of it, and the root is no further away.
 const FOUND: f64 = 1e-12;
 
 /// Where a cost is least.
@@ -299,10 +299,8 @@ pub fn root(f: impl Fn(f64) -> f64, from: f64, to: f64) -> f64 {
         if at <= low || at >= high {
             break;
         }
+        let is_found = !is_halving && (at - before).abs() <= FOUND * at.abs();
         if !is_halving {
-            if (at - before).abs() <= FOUND * at.abs() {
-                return at;
-            }
             before = at;
         }
         let value = f(at);
@@ -321,6 +319,22 @@ pub fn root(f: impl Fn(f64) -> f64, from: f64, to: f64) -> f64 {
                 f_low *= 0.5;
             }
             last = 1;
+        }
+        if is_found {
+            // Beside a slope that is steep enough the same place comes twice however far away the root is.
+            let beyond = at + FOUND.copysign(-value) * at.abs();
+            if beyond <= low || beyond >= high {
+                return at;
+            }
+            let value_beyond = f(beyond);
+            if (value_beyond < 0.0) != (value < 0.0) {
+                return at;
+            }
+            if value_beyond < 0.0 {
+                (low, f_low) = (beyond, value_beyond);
+            } else {
+                (high, f_high) = (beyond, value_beyond);
+            }
         }
     }
     0.5 * (low + high)
