@@ -184,10 +184,10 @@ fn take(
     }
     let Ok(run) = is_whole.recv() else { return };
     let ended = follow(&watched, &run, &kept, &progress, steering);
+    run.index().is_complete = true;
     let mut progress = locked(&progress);
     progress.is_over = true;
     progress.problem = ended.err().map(|error| error.to_string());
-    run.index().is_complete = true;
 }
 
 /// Takes steps and notices, and steers, until the run is over.
@@ -217,7 +217,8 @@ fn follow(
             }
         }
         while let Some(notice) = watched.notice()? {
-            take_notice(run, &mut locked(progress), notice);
+            run.index().take_events(&notice.events);
+            take_notice(&mut locked(progress), notice);
         }
         while let Ok(wish) = steering.try_recv() {
             watched.steer(&wish)?;
@@ -231,8 +232,7 @@ fn follow(
     }
 }
 
-fn take_notice(run: &Run, progress: &mut Progress, notice: Notice) {
-    run.index().take_events(&notice.events);
+fn take_notice(progress: &mut Progress, notice: Notice) {
     let latencies = (notice.first_latency..).zip(notice.latency_us.iter().copied());
     progress.latencies.extend(latencies);
     let surplus = progress.latencies.len().saturating_sub(MOST_LATENCIES);

@@ -124,6 +124,8 @@ impl Run {
     /// How far it is, for the page.
     pub fn status(&self) -> Value {
         let range = self.steps.range();
+        // Before the index is locked: whoever takes notices locks one after the other.
+        let live = self.live.as_ref().map(|live| live.status());
         let index = self.index();
         json!({
             "first": range.map(|(first, _)| first),
@@ -133,7 +135,7 @@ impl Run {
             "skipped": index.skipped,
             "vehicles": index.vehicles.len(),
             "events": index.events.len(),
-            "live": self.live.as_ref().map(|live| live.status()),
+            "live": live,
         })
     }
 }
