@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The environment variable that says where a part is written.
-pub const VARIABLE: &str = "CZ_TRACE";
+pub const VARIABLE: &str = "CZ_TRACE_PARTS";
 /// Spans of a process at most; the oldest give way.
 const MOST_SPANS: usize = 1 << 18;
 /// Events of a process at most; after that they are counted only.

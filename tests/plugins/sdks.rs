@@ -109,6 +109,8 @@ fn drives_as_the_built_in_law(arguments: &[&str], target: &str, zone: u32) {
         .success()
         .get_output()
         .clone();
+    let written = std::fs::read_dir(folder.path()).unwrap().count();
+    assert_eq!(written, 1, "the variable is the example's, and nobody else writes where it says");
     let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
     let mut seen: HashMap<(u64, u32), (f64, f64)> = HashMap::new();
     for line in std::fs::read_to_string(&trace).unwrap().lines() {
