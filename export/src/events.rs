@@ -246,7 +246,7 @@ impl<'a> Events<'a> {
 
     /// All of them, by first step; with what the recording's end says, but for what is known by the steps.
     pub fn finish(mut self, happened: &[RunEvent]) -> Vec<Event> {
-        for RunEvent { step, kind, text } in happened {
+        for RunEvent { step, kind, text, controllers } in happened {
             let kind = match kind {
                 RunEventKind::Missed => EventKind::Late,
                 RunEventKind::Refused => EventKind::Refused,
@@ -254,10 +254,9 @@ impl<'a> Events<'a> {
                 RunEventKind::Steered => EventKind::Steered,
             };
             let is_known = |known: &Event| {
-                let whom = |controller| text.contains(&format!("controller {controller}"));
                 known.kind == kind
                     && (known.first_step..=known.last_step).contains(step)
-                    && known.controller.is_some_and(whom)
+                    && known.controller.is_some_and(|controller| controllers >> controller & 1 == 1)
             };
             if !self.all.iter().any(is_known) {
                 self.all.push(Event {

@@ -78,7 +78,7 @@ impl House {
         if self.pacer.has_missed(&awaited) {
             let names = driver.names();
             trace::note(|| format!("deadline missed: {}", awaited.named(&names)));
-            self.events.missed(awaited.step, awaited.senders(&names));
+            self.events.missed(&awaited, &names);
             match self.pacer.on_miss() {
                 OnMiss::Abort => {
                     let (step, awaited) = (awaited.step, awaited.named(&driver.names()));
@@ -183,7 +183,8 @@ impl House {
         self.events.refused(step, driver.refused_senders(), || driver.refused());
         for (peer, generation) in self.arrived.iter().filter(|(_, generation)| *generation > 0) {
             let text = format!("{peer} was replaced: generation {generation}");
-            self.events.say(step, RunEventKind::Replaced, text);
+            let controllers = if peer.role == Role::Controller { 1 << peer.index } else { 0 };
+            self.events.say(step, RunEventKind::Replaced, text, controllers);
         }
         self.arrived.drain(..).filter(|(_, generation)| *generation > 0).map(move |(peer, generation)| {
             Replacement { participant: peer.to_string(), generation, step, step_ms }

@@ -1,10 +1,12 @@
 //! What a run comes to: its results, and how long its steps took.
 
 use super::{Punctuality, Settled};
-use crate::lockstep::RefusedFrames;
+use crate::lockstep::{Awaited, RefusedFrames};
 use crate::record::{RunEvent, RunEventKind};
+use crate::scenario::ControllerNames;
 use crate::world::{World, WorldSummary};
 use hdrhistogram::Histogram;
+use ipc_schemas::Role;
 use serde::{Deserialize, Serialize};
 use std::time::Instant;
 
@@ -233,26 +235,29 @@ pub(super) struct Events {
 }
 
 impl Events {
-    pub fn say(&mut self, step: u64, kind: RunEventKind, text: impl Into<String>) {
+    /// `controllers` are those it is about, one bit each.
+    pub fn say(&mut self, step: u64, kind: RunEventKind, text: String, controllers: u64) {
         if self.all.len() < MOST_EVENTS {
-            self.all.push(RunEvent { step, kind, text: text.into() });
+            self.all.push(RunEvent { step, kind, text, controllers });
         }
     }
 
     /// Somebody was not in time; news only where it was the step before.
-    pub fn missed(&mut self, step: u64, awaited: String) {
-        let is_news = self.missed.as_ref().is_none_or(|(last, who)| step > last + 1 || *who != awaited);
+    pub fn missed(&mut self, awaited: &Awaited, names: &ControllerNames) {
+        let (step, senders) = (awaited.step, awaited.senders(names));
+        let is_news = self.missed.as_ref().is_none_or(|(last, who)| step > last + 1 || *who != senders);
         if is_news {
-            self.say(step, RunEventKind::Missed, format!("not in time: {awaited}"));
+            let controllers = if awaited.role == Role::Controller { awaited.missing } else { 0 };
+            self.say(step, RunEventKind::Missed, format!("not in time: {senders}"), controllers);
         }
-        self.missed = Some((step, awaited));
+        self.missed = Some((step, senders));
     }
 
     /// So many senders have sent what was refused; those not known yet are news.
     pub fn refused(&mut self, step: u64, senders: usize, report: impl FnOnce() -> Vec<RefusedFrames>) {
         if senders > self.refused {
             for refused in report().into_iter().skip(self.refused) {
-                self.say(step, RunEventKind::Refused, refused.to_string());
+                self.say(step, RunEventKind::Refused, refused.to_string(), 0);
             }
             self.refused = senders;
         }

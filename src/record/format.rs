@@ -298,6 +298,9 @@ pub struct RunEvent {
     pub kind: RunEventKind,
     /// In words.
     pub text: String,
+    /// The controllers it is about, one bit each; none where it is about others.
+    #[serde(default)]
+    pub controllers: u64,
 }
 
 /// What happens to runs.

@@ -255,7 +255,7 @@ impl Index {
 
     /// Notes what the world, or the end of a recording, says has happened; what has been seen in a step is known.
     pub fn take_events(&mut self, events: &[RunEvent]) {
-        for RunEvent { step, kind, text } in events {
+        for RunEvent { step, kind, text, .. } in events {
             let kind = match kind {
                 RunEventKind::Missed => EventKind::Missed,
                 RunEventKind::Refused => EventKind::Refused,
