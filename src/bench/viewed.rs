@@ -112,12 +112,8 @@ pub fn viewed(
     Ok(ViewedReport { machine, points, worst_p50_ratio })
 }
 
-/// Time between two looks for steps, as views do.
-const LOOK: Duration = Duration::from_micros(500);
 /// How long a run may take to be there.
 const COMING: Duration = Duration::from_secs(60);
-/// Time between two looks whether a run still goes on.
-const ALIVE: Duration = Duration::from_millis(50);
 
 /// Lets a run begin that waits for somebody to look, and looks at it: takes and decodes every step as views do, to
 /// its end, or goes away at once.
@@ -140,18 +136,14 @@ pub fn look(run: &RunName, stays: bool) -> Result<Seen, BenchError> {
     if !stays {
         // As soon as it has begun.
         while watched.step()?.is_none() && watched.goes_on() {
-            std::thread::sleep(LOOK);
+            std::thread::sleep(Watched::LOOK);
         }
         return Ok(seen);
     }
     let _ = rustix::process::nice(Watched::NICENESS);
-    let (mut looked, mut goes_on) = (Instant::now(), true);
+    let mut goes_on = true;
     while goes_on {
-        // In this order: what was sent before it ended is taken.
-        if looked.elapsed() >= ALIVE {
-            looked = Instant::now();
-            goes_on = watched.goes_on();
-        }
+        goes_on = watched.goes_on();
         while let Some((number, block)) = watched.step()? {
             if let Ok(step) = Step::decode(block.bytes()) {
                 seen.shown_steps += 1;
@@ -162,7 +154,7 @@ pub fn look(run: &RunName, stays: bool) -> Result<Seen, BenchError> {
         while let Some(notice) = watched.notice()? {
             seen.left_out_steps = notice.left_out_steps;
         }
-        std::thread::sleep(LOOK);
+        std::thread::sleep(Watched::LOOK);
     }
     Ok(seen)
 }

@@ -21,6 +21,7 @@ use crate::transport::iox::{
 };
 use ipc_schemas::{Assignment, Role, VehicleCommand, VehicleState};
 use serde::{Deserialize, Serialize};
+use std::cell::Cell;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -270,7 +271,7 @@ impl Viewing {
                     && pacer.steer(wish, step)
                 {
                     trace::note(|| wish.to_string());
-                    events.say(step, RunEventKind::Steered, wish.to_string());
+                    events.say(step, RunEventKind::Steered, wish.to_string(), 0);
                     self.noticed = None;
                 }
             }
@@ -328,10 +329,17 @@ pub struct Watched {
     notices: BlockInbox,
     steering: Option<SteeringOutbox>,
     world: u32,
+    /// When the world was last seen.
+    seen: Cell<Instant>,
     _space: RunSpace,
 }
 
+/// Time between two looks whether a world is still there.
+const STILL_THERE: Duration = Duration::from_millis(50);
+
 impl Watched {
+    /// Time between two looks for steps.
+    pub const LOOK: Duration = Duration::from_micros(500);
     /// How nice whoever looks is to be to the processes of the run.
     pub const NICENESS: i32 = 10;
 
@@ -363,7 +371,11 @@ impl Watched {
             return Ok(None);
         };
         let steering = space.open_steering(SERVICE_STEERING)?;
-        Ok(Some((Watched { steps, notices, steering, world, _space: space }, metadata, Arc::new(scenario))))
+        Ok(Some((
+            Watched { steps, notices, steering, world, seen: Cell::new(Instant::now()), _space: space },
+            metadata,
+            Arc::new(scenario),
+        )))
     }
 
     /// The next step, with its number.
@@ -398,8 +410,16 @@ impl Watched {
         Ok(true)
     }
 
-    /// Whether its world is still there.
+    /// Whether its world is still there, or was just now. To be asked before the last steps are taken: what was sent
+    /// before it ended is there then.
     pub fn goes_on(&self) -> bool {
-        super::peers::is_alive(self.world)
+        if self.seen.get().elapsed() < STILL_THERE {
+            return true;
+        }
+        let is_there = super::peers::is_alive(self.world);
+        if is_there {
+            self.seen.set(Instant::now());
+        }
+        is_there
     }
 }

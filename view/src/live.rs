@@ -13,8 +13,6 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Time between two looks for steps.
-const LOOK: Duration = Duration::from_micros(500);
 /// Latencies kept at most; the oldest give way.
 const MOST_LATENCIES: usize = 200_000;
 
@@ -198,14 +196,9 @@ fn follow(
     progress: &Mutex<Progress>,
     steering: &Receiver<Steering>,
 ) -> Result<(), ProcessError> {
-    let mut looked = Instant::now();
     loop {
         let mut is_idle = true;
-        // In this order: what was sent before it ended is taken.
-        let goes_on = looked.elapsed() < Duration::from_millis(50) || watched.goes_on();
-        if looked.elapsed() >= Duration::from_millis(50) {
-            looked = Instant::now();
-        }
+        let goes_on = watched.goes_on();
         while let Some((number, block)) = watched.step()? {
             is_idle = false;
             if let Ok(step) = Step::decode(block.bytes()) {
@@ -227,7 +220,7 @@ fn follow(
             if !goes_on {
                 return Ok(());
             }
-            std::thread::sleep(LOOK);
+            std::thread::sleep(Watched::LOOK);
         }
     }
 }
