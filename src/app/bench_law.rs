@@ -4,7 +4,7 @@ use super::AppError;
 use super::args::{MeasureArgs, ScenarioArgs};
 use super::bench::run_processes;
 use super::measured::{align, scenario_of, table as new_table};
-use crate::bench::{BenchError, Machine};
+use crate::bench::{self, BenchError, Machine};
 use crate::process::{Outcome, StopFlag, run_in_process};
 use serde::Serialize;
 use std::sync::Arc;
@@ -32,9 +32,8 @@ pub(super) struct Steps {
 impl Steps {
     fn median(outcomes: &[Outcome]) -> Steps {
         let median = |of: fn(&Outcome) -> u64| {
-            let mut values: Vec<u64> = outcomes.iter().map(of).collect();
-            values.sort_unstable();
-            values[values.len() / 2] as f64
+            let mut values: Vec<f64> = outcomes.iter().map(|o| of(o) as f64).collect();
+            bench::median(&mut values)
         };
         Steps { steady_ns: median(|o| o.steady_ns.p50), event_ns: median(|o| o.event_ns.p50) }
     }

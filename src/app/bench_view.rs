@@ -4,26 +4,20 @@ use super::AppError;
 use super::args::{
     ConductArgs, Restart, ScenarioArgs, ShareArgs, SideBySide, SteeringArgs, TimingArgs, ViewBenchArgs,
 };
-use super::measured::{WAIT, align, run_as, scenario_of, table as new_table};
+use super::measured::{WAIT, align, run_as, scene, table as new_table};
 use super::run::own_name;
 use crate::bench::{self, BenchError, Family, NINE, THREE, Timed, ViewedOptions, ViewedReport};
 use crate::process::WaitMode;
 
 const MANY: &str = "10 000 vehicles";
 
-fn scene(name: &str, quick: bool) -> (ScenarioArgs, ShareArgs) {
-    match name {
-        THREE => (scenario_of(quick), ShareArgs { ctrl_procs: 1, coord_procs: 1 }),
-        NINE => {
-            let scenario = ScenarioArgs { scenario: Some("corridor-8".to_owned()), ..ScenarioArgs::none() };
-            (scenario, ShareArgs { ctrl_procs: 4, coord_procs: 4 })
-        }
-        _ => {
-            let side_by_side = Some(SideBySide { family: Family::Corridors, vehicles: 10_000 });
-            let scenario = ScenarioArgs { side_by_side, ..ScenarioArgs::none() };
-            (scenario, ShareArgs { ctrl_procs: 1, coord_procs: 1 })
-        }
+fn scene_or_many(name: &str, quick: bool) -> (ScenarioArgs, ShareArgs) {
+    if name == MANY {
+        let side_by_side = Some(SideBySide { family: Family::Corridors, vehicles: 10_000 });
+        let scenario = ScenarioArgs { side_by_side, ..ScenarioArgs::none() };
+        return (scenario, ShareArgs { ctrl_procs: 1, coord_procs: 1 });
     }
+    scene(name, quick)
 }
 
 pub(super) fn measure(args: &ViewBenchArgs) -> Result<ViewedReport, AppError> {
@@ -39,7 +33,7 @@ pub(super) fn measure(args: &ViewBenchArgs) -> Result<ViewedReport, AppError> {
         steering,
     };
     let run = |name: &str, stays: bool| {
-        let (scenario, share) = scene(name, quick);
+        let (scenario, share) = scene_or_many(name, quick);
         // A thread: whatever process a supervisor finds among its children at the end of a run, it ends.
         let looker = std::thread::spawn(move || bench::look(&own_name(), stays));
         let outcome = run_as(&scenario, share, conduct, None).map_err(BenchError::Run)?;

@@ -4,7 +4,7 @@ use super::AppError;
 use super::args::{
     ConductArgs, Restart, ScenarioArgs, ShareArgs, SteeringArgs, TimingArgs, WaitArgs, WaitBenchArgs,
 };
-use super::measured::{WAIT, align, run_as, scenario_of, start_peer, table as new_table};
+use super::measured::{WAIT, align, run_as, scene, start_peer, table as new_table};
 use crate::bench::{self, BenchError, NINE, Side, THREE, Timed, WaitingOptions, WaitingReport};
 use crate::process::{Placement, WaitMode, check_cores};
 use std::path::Path;
@@ -25,14 +25,6 @@ fn conduct(wait_mode: WaitMode) -> ConductArgs {
         record_lag: None,
         steering: SteeringArgs::default(),
     }
-}
-
-fn scene(name: &str, quick: bool) -> (ScenarioArgs, ShareArgs) {
-    if name == THREE {
-        return (scenario_of(quick), ShareArgs { ctrl_procs: 1, coord_procs: 1 });
-    }
-    let scenario = ScenarioArgs { scenario: Some("corridor-8".to_owned()), ..ScenarioArgs::none() };
-    (scenario, ShareArgs { ctrl_procs: 4, coord_procs: 4 })
 }
 
 pub(super) fn measure(args: &WaitBenchArgs) -> Result<WaitingReport, AppError> {

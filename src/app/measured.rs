@@ -5,7 +5,7 @@ use super::args::{ConductArgs, ScenarioArgs, ShareArgs, WaitArgs};
 use super::record::Recording;
 use super::run::own_name;
 use super::supervise::{self, Plan};
-use crate::bench::MEASURED;
+use crate::bench::{MEASURED, THREE};
 use crate::process::{Outcome, Placement, new_run_id};
 use comfy_table::{CellAlignment, Table, presets};
 use std::path::Path;
@@ -16,6 +16,15 @@ use std::time::Duration;
 pub(super) fn scenario_of(quick: bool) -> ScenarioArgs {
     let set = if quick { vec![] } else { vec!["end.vehicles=600".to_owned()] };
     ScenarioArgs { scenario: Some(MEASURED.to_owned()), seed: Some(1), set, side_by_side: None }
+}
+
+/// A scene of measurements in processes, by name: [`THREE`] or [`NINE`](crate::bench::NINE).
+pub(super) fn scene(name: &str, quick: bool) -> (ScenarioArgs, ShareArgs) {
+    if name == THREE {
+        return (scenario_of(quick), ShareArgs { ctrl_procs: 1, coord_procs: 1 });
+    }
+    let scenario = ScenarioArgs { scenario: Some("corridor-8".to_owned()), ..ScenarioArgs::none() };
+    (scenario, ShareArgs { ctrl_procs: 4, coord_procs: 4 })
 }
 
 pub(super) const WAIT: WaitArgs = WaitArgs {
