@@ -18,6 +18,13 @@ fn alone(directory: &Path) -> PathBuf {
     program
 }
 
+/// Puts a program of this name beside it, which says what it was given and ends with this code.
+fn put_beside(directory: &Path, name: &str, code: u8) {
+    let sibling = directory.join(name);
+    std::fs::write(&sibling, format!("#!/bin/sh\nprintf '%s|' \"$@\"\nexit {code}\n")).unwrap();
+    std::fs::set_permissions(&sibling, PermissionsExt::from_mode(0o755)).unwrap();
+}
+
 /// Runs it as somebody would who has no cargo.
 fn run(program: &Path, arguments: &[&str]) -> Output {
     Command::new(program)
@@ -43,9 +50,7 @@ fn arguments_and_exit_code_go_through_as_they_are() {
     let _alone = ALONE.lock();
     let directory = tempfile::tempdir().unwrap();
     let program = alone(directory.path());
-    let sibling = directory.path().join("cz-export");
-    std::fs::write(&sibling, "#!/bin/sh\nprintf '%s|' \"$@\"\nexit 7\n").unwrap();
-    std::fs::set_permissions(&sibling, PermissionsExt::from_mode(0o755)).unwrap();
+    put_beside(directory.path(), "cz-export", 7);
     let output = run(&program, &["export", "a b.czlog", "--to", "fcd", "--help", "-V", "--", "--out"]);
     let said = String::from_utf8(output.stdout).unwrap();
     assert_eq!((output.status.code(), said.as_str()), (Some(7), "a b.czlog|--to|fcd|--help|-V|--|--out|"));
@@ -56,9 +61,7 @@ fn a_run_with_a_view_is_started_by_the_view() {
     let _alone = ALONE.lock();
     let directory = tempfile::tempdir().unwrap();
     let program = alone(directory.path());
-    let sibling = directory.path().join("cz-view");
-    std::fs::write(&sibling, "#!/bin/sh\nprintf '%s|' \"$@\"\n").unwrap();
-    std::fs::set_permissions(&sibling, PermissionsExt::from_mode(0o755)).unwrap();
+    put_beside(directory.path(), "cz-view", 0);
     let output = run(&program, &["run", "--pace", "realtime", "--view", "intersection", "--seed", "2"]);
     let said = String::from_utf8(output.stdout).unwrap();
     assert_eq!(said, "--|--pace|realtime|intersection|--seed|2|");

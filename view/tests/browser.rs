@@ -7,7 +7,7 @@
 mod common;
 
 use common::browser::Browser;
-use common::{Page, record, record_steps};
+use common::{Page, Recording, record, record_steps};
 use control_zones::bench::{Family, side_by_side};
 use control_zones::record::{InForce, Reader, words};
 use control_zones::scenario::{Override, load_embedded};
@@ -15,6 +15,16 @@ use serde_json::{Value, json};
 
 const READY: &str =
     "window.view && view.state.maps?.[0]?.frame && view.state.runs.every(r => r.status.is_complete)";
+
+/// A browser in which a recording is open, its page, and the recording; nothing where no browser is installed.
+fn open(file: impl FnOnce() -> Recording) -> Option<(Browser, Page, Recording)> {
+    let browser = Browser::start((1440, 900))?;
+    let file = file();
+    let page = Page::of(&[file.path()]);
+    browser.open(page.address());
+    browser.until(READY);
+    Some((browser, page, file))
+}
 
 fn shown(browser: &Browser, field: &str) -> String {
     let text =
@@ -32,11 +42,9 @@ fn go_to(browser: &Browser, step: u64) {
 
 #[test]
 fn clicking_and_scrubbing_tell_of_a_vehicle_what_the_recording_holds() {
-    let Some(browser) = Browser::start((1440, 900)) else { return };
-    let file = record("two-merges", &["--set", "end.vehicles=50"]);
-    let page = Page::of(&[file.path()]);
-    browser.open(page.address());
-    browser.until(READY);
+    let Some((browser, _page, file)) = open(|| record("two-merges", &["--set", "end.vehicles=50"])) else {
+        return;
+    };
     let reader = Reader::open(file.path()).unwrap();
     let scenario = reader.scenario();
     let mut compared = 0;
@@ -118,11 +126,9 @@ fn pixel(browser: &Browser, place: &str) -> (f64, f64) {
 
 #[test]
 fn a_zone_that_is_clicked_tells_its_order_and_v_m() {
-    let Some(browser) = Browser::start((1440, 900)) else { return };
-    let file = record("paper", &["--set", "end.vehicles=50"]);
-    let page = Page::of(&[file.path()]);
-    browser.open(page.address());
-    browser.until(READY);
+    let Some((browser, _page, file)) = open(|| record("paper", &["--set", "end.vehicles=50"])) else {
+        return;
+    };
     let reader = Reader::open(file.path()).unwrap();
     let mut in_force = InForce::default();
     let mut orders = 0;
@@ -169,11 +175,9 @@ fn a_zone_that_is_clicked_tells_its_order_and_v_m() {
 
 #[test]
 fn keys_zoom_theme_and_screens_of_many_pixels() {
-    let Some(browser) = Browser::start((1440, 900)) else { return };
-    let file = record("two-merges", &["--set", "end.vehicles=20"]);
-    let page = Page::of(&[file.path()]);
-    browser.open(page.address());
-    browser.until(READY);
+    let Some((browser, _page, _file)) = open(|| record("two-merges", &["--set", "end.vehicles=20"])) else {
+        return;
+    };
     go_to(&browser, 300);
     let is = |expression: &str| assert_eq!(browser.evaluate(expression), Value::Bool(true), "{expression}");
     let press = |key: &str, until: &str| {
@@ -243,11 +247,9 @@ fn as_seen([r, g, b]: [f64; 3], lacking: usize) -> [f64; 3] {
 
 #[test]
 fn colours_can_be_told_apart_with_any_kind_of_colour_vision() {
-    let Some(browser) = Browser::start((1440, 900)) else { return };
-    let file = record("two-merges", &["--set", "end.vehicles=5"]);
-    let page = Page::of(&[file.path()]);
-    browser.open(page.address());
-    browser.until(READY);
+    let Some((browser, _page, _file)) = open(|| record("two-merges", &["--set", "end.vehicles=5"])) else {
+        return;
+    };
     for theme in ["light", "dark"] {
         browser.evaluate(&format!("view.setTheme('{theme}')"));
         // As the canvas takes them: rgb.
@@ -292,14 +294,14 @@ fn colours_can_be_told_apart_with_any_kind_of_colour_vision() {
 
 #[test]
 fn what_is_missing_of_a_run_is_said() {
-    let Some(browser) = Browser::start((1440, 900)) else { return };
     let overrides: Vec<Override> = vec!["end.vehicles=20".parse().unwrap()];
     let scenario = load_embedded("two-merges", &overrides, None).unwrap();
     // As of a run that goes as fast as it can.
-    let file = record_steps("some.czlog", scenario, |step| step.is_multiple_of(7));
-    let page = Page::of(&[file.path()]);
-    browser.open(page.address());
-    browser.until(READY);
+    let Some((browser, page, file)) =
+        open(|| record_steps("some.czlog", scenario, |step| step.is_multiple_of(7)))
+    else {
+        return;
+    };
     let steps: Vec<u64> = Reader::open(file.path()).unwrap().step_numbers().collect();
     let missing = steps[steps.len() - 1] + 1 - steps.len() as u64;
     browser.evaluate("view.goto(703)");
@@ -321,12 +323,11 @@ fn what_is_missing_of_a_run_is_said() {
 #[test]
 #[ignore = "a measurement: frames per second with ten thousand vehicles"]
 fn ten_thousand_vehicles() {
-    let Some(browser) = Browser::start((1440, 900)) else { return };
     let scenario = side_by_side(Family::Corridors, 10_000, 90.0).unwrap();
-    let file = record_steps("many.czlog", scenario, |step| step >= 700);
-    let page = Page::of(&[file.path()]);
-    browser.open(page.address());
-    browser.until(READY);
+    let Some((browser, _page, _file)) = open(|| record_steps("many.czlog", scenario, |step| step >= 700))
+    else {
+        return;
+    };
     browser.evaluate("view.goto(705)");
     browser.until("view.state.maps[0].frame?.step === 705");
     let vehicles = browser.evaluate("view.state.maps[0].frame.count");
