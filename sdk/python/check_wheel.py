@@ -1,4 +1,4 @@
-"""Installs a wheel where there is nothing else, and runs the main job and a controller in Python from there.
+"""Installs a wheel where there is nothing else, and runs the main job, a controller in Python and the environments there.
 
 Usage: python3 sdk/python/check_wheel.py WHEEL
 """
@@ -14,6 +14,7 @@ import time
 from pathlib import Path
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/python/cruise.py"
+ENVIRONMENTS = Path(__file__).resolve().with_name("check_env.py")
 PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-view", "cz-top")
 
 
@@ -48,7 +49,8 @@ def check(wheel: Path, place: Path) -> None:
     empty = Empty(place)
     if subprocess.run(["sh", "-c", "command -v cargo"], env=empty.environment, stdout=subprocess.PIPE).stdout:
         raise SystemExit("cargo is on the path of what is to do without it")
-    empty.ran("the wheel and numpy installed", "pip", "install", "--quiet", "--disable-pip-version-check", str(wheel), "numpy")
+    install = ("pip", "install", "--quiet", "--disable-pip-version-check")
+    empty.ran("the wheel and numpy installed", *install, str(wheel), "numpy")
     for program in PROGRAMS:
         if not (empty.programs / program).is_file():
             raise SystemExit(f"{wheel.name} does not bring {program}")
@@ -66,6 +68,9 @@ def check(wheel: Path, place: Path) -> None:
     empty.ran("cz plugin check of it", "cz", "plugin", "check", "--", "python", str(EXAMPLE))
     empty.ran("cz report", "cz", "report", "run.czlog", "--out", "run.html")
     empty.ran("cz export", "cz", "export", "run.czlog", "--to", "parquet")
+    empty.ran("what environments need installed", *install, f"{wheel}[env]")
+    # Isolated: what lies beside the script is not what was installed.
+    print(empty.ran("the environments' checkers", "python", "-I", str(ENVIRONMENTS)), end="")
     for program in ("cz-view", "cz-top", "cz-world", "cz-coord", "cz-ctrl"):
         empty.ran(f"{program} --help", program, "--help")
 

@@ -1,4 +1,4 @@
-"""Puts the programs of a release build into the wheel where `CZ_PROGRAMS` names their directory.
+"""Puts programs and library of a release build into the wheel where `CZ_PROGRAMS` names their directory.
 
 Without it the wheel is pure Python, so that `pip install ./sdk/python` needs no Rust.
 """
@@ -16,6 +16,8 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
+#: What `control_zones.env` loads.
+LIBRARY = "libcontrol_zones_env.so"
 PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-view", "cz-top")
 
 
@@ -29,12 +31,12 @@ class Programs(BuildHookInterface):  # type: ignore[type-arg]
         named = os.environ.get("CZ_PROGRAMS")
         if not named or version == "editable":
             return
-        found = [Path(named).resolve() / program for program in PROGRAMS]
+        found = [Path(named).resolve() / program for program in (*PROGRAMS, LIBRARY)]
         missing = [path.name for path in found if not path.is_file()]
         if missing:
             raise SystemExit(
                 f"CZ_PROGRAMS={named}: {', '.join(missing)} not there; expected the directory of "
-                "`cargo build --release --workspace --bins`, such as target/release"
+                "`cargo build --release --workspace --bins` and `-p control-zones-env`, such as target/release"
             )
         self._copies = tempfile.TemporaryDirectory(prefix="cz-wheel-")
         glibc = 17
@@ -42,7 +44,10 @@ class Programs(BuildHookInterface):  # type: ignore[type-arg]
             copy = Path(self._copies.name) / path.name
             shutil.copy(path, copy)
             subprocess.run(["strip", str(copy)], check=True)
-            build_data["shared_scripts"][str(copy)] = path.name
+            if path.name == LIBRARY:
+                build_data["force_include"][str(copy)] = f"control_zones/{LIBRARY}"
+            else:
+                build_data["shared_scripts"][str(copy)] = path.name
             glibc = max(glibc, *needed_glibc(copy))
         build_data["pure_python"] = False
         build_data["tag"] = f"py3-none-manylinux_2_{glibc}_{platform.machine()}"

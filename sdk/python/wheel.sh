@@ -7,6 +7,7 @@ cd "$(dirname "$0")/../.."
 out=${1:-target/wheels}
 if [ -z "${CZ_PROGRAMS:-}" ]; then
     cargo build --release --workspace --bins
+    cargo build --release -p control-zones-env
     CZ_PROGRAMS=$(realpath "${CARGO_TARGET_DIR:-target}/release")
     export CZ_PROGRAMS
 fi

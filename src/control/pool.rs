@@ -213,6 +213,21 @@ impl ControllerPool {
         })
     }
 
+    /// Shows what the laws decide by, of each vehicle in the order of its command, and changes nothing.
+    ///
+    /// # Errors
+    /// When state and coordination contradict each other.
+    pub fn survey(
+        &mut self,
+        time_s: f64,
+        states: &[VehicleState],
+        mut show: impl FnMut(&VehicleState, &Situation, &mut dyn Iterator<Item = Partner>),
+    ) -> Result<(), PoolError> {
+        self.visit(time_s, states, |_, mut scene| {
+            scene.each(|state, situation, mut partners, _| show(state, situation, &mut partners));
+        })
+    }
+
     /// Calls `with` for each zone of the pool that has members, in frame order.
     #[inline]
     fn visit(

@@ -230,6 +230,17 @@ impl World {
         self.visits.as_deref().unwrap_or_default()
     }
 
+    /// What the vehicles of a zone have cost so far, m^2/s^3: beta times the time they were in it, and their energy;
+    /// those that have left it and those that are in it.
+    pub fn zone_cost(&self, zone: ZoneId) -> f64 {
+        let metrics = &self.metrics[zone as usize];
+        let now_s = self.scenario.time_s(self.step);
+        let cost = |time_s: f64, energy: f64| self.scenario.beta * time_s + energy;
+        let inside =
+            self.members(zone as usize).iter().map(|car| cost(now_s - car.entry_time_s, car.visit.energy));
+        cost(metrics.time_s, metrics.energy) + inside.sum::<f64>()
+    }
+
     /// Vehicles that have entered the network so far.
     pub fn arrived(&self) -> u32 {
         self.arrived

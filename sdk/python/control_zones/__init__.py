@@ -16,7 +16,8 @@ may be kept, where numpy is installed, and lists where it is not.
 """
 
 from . import _schemas as schemas
+from ._features import features
 from ._session import Error, Run, Session, run
 from ._view import Partner, ZoneView
 
-__all__ = ["Error", "Partner", "Run", "Session", "ZoneView", "run", "schemas"]
+__all__ = ["Error", "Partner", "Run", "Session", "ZoneView", "features", "run", "schemas"]
