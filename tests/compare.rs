@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
 
 use control_zones::bounds::{Traffic, joint};
-use control_zones::compare::cache::Cache;
+use control_zones::compare::cache::{Cache, bytes};
 use control_zones::compare::cli::Seeds;
 use control_zones::compare::report::{Block, FORMAT, Report};
 use control_zones::compare::sample::Sample;
@@ -49,8 +49,10 @@ fn a_report_is_the_same_for_any_number_of_jobs_and_from_the_cache() {
     let run = &kept[run.unwrap()];
     assert_eq!(kept.len(), 12, "a file per run, and one per replicate for its bounds: {kept:?}");
     // What is there is taken, what is broken is done again.
-    let mark = std::fs::read_to_string(run).unwrap();
-    std::fs::write(run, mark.replacen("\"overlap_pairs\":", "\"overlap_pairs\":77", 1)).unwrap();
+    let file = run.file_name().unwrap().to_str().unwrap();
+    let mut sample: Sample = cache().find(file).unwrap();
+    sample.overlap_pairs += 77;
+    cache().put(file, &bytes(&sample)).unwrap();
     assert!(once != report(compare(&asked, 2, cache())).json(), "the cache is read");
     std::fs::write(run, "{").unwrap();
     assert!(once == report(compare(&asked, 2, cache())).json());
@@ -63,6 +65,48 @@ fn a_report_is_the_same_for_any_number_of_jobs_and_from_the_cache() {
         assert!(text.starts_with(start), "{file}: {}", &text[..40]);
     }
     assert!(std::fs::read(dir.path().join("out/pareto-1-paper.png")).unwrap().starts_with(b"\x89PNG"));
+}
+
+#[test]
+fn a_recorded_run_shows_what_the_run_shows() {
+    let directory = tempfile::tempdir().unwrap();
+    let file = directory.path().join("a.czlog");
+    let mut cz = std::process::Command::new(env!("CARGO_BIN_EXE_cz"));
+    cz.args([
+        "run",
+        "paper",
+        "--in-process",
+        "--seed",
+        "2",
+        "--set",
+        "end.vehicles=24",
+        "--set",
+        "shield=on",
+    ]);
+    let output = cz.arg("--record").arg(&file).output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    let sets = ["end.vehicles=24", "shield=on"].map(str::to_owned);
+    let scenario = control_zones::compare::load(Some("paper"), 2, &sets).unwrap();
+    assert_eq!(Sample::recorded(&file).unwrap(), Sample::of(&scenario, "the same").unwrap());
+    assert!(Sample::recorded(directory.path()).is_err());
+}
+
+#[test]
+fn a_policy_may_have_controllers_of_ones_own_and_their_faults_are_named() {
+    let directory = tempfile::tempdir().unwrap();
+    let policy = |controllers: &str| {
+        let file = directory.path().join("mine.toml");
+        std::fs::write(&file, format!("about = \"mine\"\ncontrollers = [{controllers}]\n")).unwrap();
+        let mut cz = std::process::Command::new(env!("CARGO_BIN_EXE_cz"));
+        let output =
+            cz.args(["compare", file.to_str().unwrap(), "--scenario", "paper", "--seeds", "1"]).output();
+        let output = output.unwrap();
+        (output.status.code(), String::from_utf8(output.stderr).unwrap())
+    };
+    let (code, said) = policy("\"merge-1\"");
+    assert!(code == Some(2) && said.contains("merge-1: expected TARGET=COMMAND"), "{code:?} {said}");
+    let (code, said) = policy("\"merge-1=exit 7\"");
+    assert!(code == Some(1) && said.contains("seed 1") && said.contains("merge-1"), "{code:?} {said}");
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use super::AppError;
 use super::args::ScenarioArgs;
-use crate::scenario::Scenario;
+use crate::scenario::{Scenario, declaration, target_and_command};
 
 /// The scenario arguments with `--controller`s turned into `--set`s, and the scenario they give.
 ///
@@ -16,17 +16,14 @@ pub(super) fn load(
     if controllers.is_empty() {
         return Ok((scenario.clone(), loaded));
     }
-    let quote = |text: &str| toml::Value::String(text.to_owned()).to_string();
     let mut arguments = scenario.clone();
     let mut declared = Vec::new();
     for text in controllers {
-        let Some((target, command)) = text.split_once('=').filter(|(t, c)| !t.is_empty() && !c.is_empty())
-        else {
-            let expected = "TARGET=COMMAND, such as merge-2=\"python3 mine.py\"";
-            return Err(AppError::Usage(format!("--controller {text}: expected {expected}")));
-        };
+        let (target, command) =
+            target_and_command(text).map_err(|problem| AppError::Usage(format!("--controller {problem}")))?;
         if loaded.plugins.iter().any(|p| p.name == target) {
-            arguments.set.push(format!("controllers.{target}.command={}", quote(command)));
+            let command = toml::Value::String(command.to_owned());
+            arguments.set.push(format!("controllers.{target}.command={command}"));
             continue;
         }
         if !loaded.plugins.is_empty() {
@@ -36,22 +33,10 @@ pub(super) fn load(
                 "--controller {text}: the scenario declares its controllers; expected one of {names}"
             )));
         }
-        let (paths, zones): (Vec<_>, Vec<_>) = target.split(',').partition(|t| t.contains('.'));
-        let list = |key: &str, items: &[&str]| match items {
-            [] => String::new(),
-            _ => format!("{key} = [{}], ", items.iter().map(|i| quote(i)).collect::<Vec<_>>().join(", ")),
-        };
-        declared.push(format!(
-            "{{name = {}, {}{}command = {}}}",
-            quote(&target.replace('.', "-").replace(',', "_")),
-            list("zones", &zones),
-            list("paths", &paths),
-            quote(command)
-        ));
+        declared.push(text.clone());
     }
-    if !declared.is_empty() {
-        arguments.set.push(format!("controllers=[{}]", declared.join(", ")));
-    }
+    let declared = declaration(&declared).map_err(AppError::Usage)?;
+    arguments.set.extend(declared);
     let loaded = arguments.load()?;
     Ok((arguments, loaded))
 }

@@ -84,6 +84,14 @@ fn after_help() -> String {
     format!("Policies: {}.\nTables: {}.", policy::known(), tables::names().collect::<Vec<_>>().join(", "))
 }
 
+/// Shows how many runs are done.
+pub fn bar() -> ProgressBar {
+    ProgressBar::new(0).with_style(
+        ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} runs, {elapsed} gone, {eta} to go")
+            .expect("the template is a constant"),
+    )
+}
+
 /// Runs the command and returns what goes to standard output; a progress bar is on a terminal's standard error.
 pub fn main(args: &CompareArgs) -> Result<String, CompareError> {
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
@@ -99,10 +107,7 @@ pub fn main(args: &CompareArgs) -> Result<String, CompareError> {
             joint: args.joint.clone(),
         }],
     };
-    let bar = ProgressBar::new(0).with_style(
-        ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} runs, {elapsed} gone, {eta} to go")
-            .expect("the template is a constant"),
-    );
+    let bar = bar();
     let mut blocks = Vec::new();
     for comparison in &comparisons {
         bar.set_message(comparison.scenario.clone().unwrap_or_default());

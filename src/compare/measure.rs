@@ -1,6 +1,6 @@
 //! What is told of a run.
 
-use super::sample::Sample;
+use super::sample::{Sample, VehicleSample};
 use crate::bounds::Bounds;
 use crate::bounds::joint::Found;
 use crate::reproduce::statistics::Interval;
@@ -46,12 +46,38 @@ pub struct Measure {
     pub decimals: usize,
     /// What becomes of replicates.
     pub pool: Pool,
-    /// The value, where there is one.
-    pub of: fn(&Row) -> Option<f64>,
+    /// What it is worked out from.
+    pub of: Of,
 }
 
-fn mean(row: &Row, of: impl Fn(&super::sample::VehicleSample) -> f64) -> Option<f64> {
-    let vehicles = &row.sample.vehicles;
+/// What a measure is worked out from, and how; there may be no value.
+#[derive(Clone, Copy, Debug)]
+pub enum Of {
+    /// From a run alone.
+    Sample(fn(&Sample) -> Option<f64>),
+    /// From a run and what its vehicles take at least.
+    Row(fn(&Row) -> Option<f64>),
+}
+
+impl Measure {
+    /// The value, where there is one.
+    pub fn value(&self, row: &Row) -> Option<f64> {
+        match self.of {
+            Of::Sample(of) => of(&row.sample),
+            Of::Row(of) => of(row),
+        }
+    }
+
+    /// Its unit, where it has one.
+    pub fn unit(&self) -> Option<&'static str> {
+        let units = ["m²/s³", "m/s³", "m·s", "vehicles/h", "ml", "m", "s"];
+        let (_, last) = self.name.rsplit_once(", ")?;
+        units.into_iter().find(|unit| *unit == last)
+    }
+}
+
+fn mean(sample: &Sample, of: impl Fn(&VehicleSample) -> f64) -> Option<f64> {
+    let vehicles = &sample.vehicles;
     let sum: f64 = vehicles.iter().map(of).sum();
     (!vehicles.is_empty()).then(|| sum / vehicles.len() as f64)
 }
@@ -70,18 +96,28 @@ const fn measure(
     name: &'static str,
     decimals: usize,
     pool: Pool,
+    of: fn(&Sample) -> Option<f64>,
+) -> Measure {
+    Measure { id, name, decimals, pool, of: Of::Sample(of) }
+}
+
+const fn beside(
+    id: &'static str,
+    name: &'static str,
+    decimals: usize,
+    pool: Pool,
     of: fn(&Row) -> Option<f64>,
 ) -> Measure {
-    Measure { id, name, decimals, pool, of }
+    Measure { id, name, decimals, pool, of: Of::Row(of) }
 }
 
 /// Cost in total, as the paper adds it.
 pub const TOTAL: Measure =
-    measure("total", "total cost, sum of the zones' means", 3, Pool::Mean, |r| Some(r.sample.total()));
+    measure("total", "total cost, sum of the zones' means", 3, Pool::Mean, |r| Some(r.total()));
 
 /// Cost per vehicle over its whole way, with what it waited outside.
 pub const PER_VEHICLE: Measure = measure("per_vehicle", "cost per vehicle", 3, Pool::Mean, |r| {
-    let beta = r.sample.beta;
+    let beta = r.beta;
     mean(r, |v| beta * v.time_s() + v.energy())
 });
 
@@ -96,83 +132,83 @@ pub const ENERGY: Measure =
 /// All measures but the costs per zone, in the order of the table.
 pub const MEASURES: [Measure; 30] = [
     TOTAL,
-    measure("alone_total", "bound: vehicles alone (rigorous)", 3, Pool::Mean, |r| Some(r.bounds.total)),
-    measure("merging_total", "bound: pairs that merge (rigorous)", 3, Pool::Mean, |r| r.bounds.merging_total),
-    measure("joint_total", "centralised optimum (local)", 3, Pool::Mean, |r| Some(r.joint.as_ref()?.total)),
-    measure("joint_exposure", "its exposure per vehicle, sum of zones, m·s", 3, Pool::Mean, |r| {
+    beside("alone_total", "bound: vehicles alone (rigorous)", 3, Pool::Mean, |r| Some(r.bounds.total)),
+    beside("merging_total", "bound: pairs that merge (rigorous)", 3, Pool::Mean, |r| r.bounds.merging_total),
+    beside("joint_total", "centralised optimum (local)", 3, Pool::Mean, |r| Some(r.joint.as_ref()?.total)),
+    beside("joint_exposure", "its exposure per vehicle, sum of zones, m·s", 3, Pool::Mean, |r| {
         Some(r.joint.as_ref()?.exposure_ms.iter().sum())
     }),
-    measure("joint_missed_s", "its duties missed at most, s", 3, Pool::Greatest, |r| {
+    beside("joint_missed_s", "its duties missed at most, s", 3, Pool::Greatest, |r| {
         Some(r.joint.as_ref()?.missed_s)
     }),
-    measure("of_alone", "total / vehicles alone (rigorous)", 3, Pool::Mean, |r| {
+    beside("of_alone", "total / vehicles alone (rigorous)", 3, Pool::Mean, |r| {
         Some(r.sample.total() / r.bounds.total)
     }),
-    measure("of_merging", "total / pairs that merge (rigorous)", 3, Pool::Mean, |r| {
+    beside("of_merging", "total / pairs that merge (rigorous)", 3, Pool::Mean, |r| {
         Some(r.sample.total() / r.bounds.merging_total?)
     }),
-    measure("of_joint", "total / centralised optimum (local)", 3, Pool::Mean, |r| {
+    beside("of_joint", "total / centralised optimum (local)", 3, Pool::Mean, |r| {
         Some(r.sample.total() / r.joint.as_ref()?.total)
     }),
     PER_VEHICLE,
-    measure("per_vehicle_of_alone", "cost per vehicle / vehicles alone (rigorous)", 3, Pool::Mean, |r| {
-        Some((PER_VEHICLE.of)(r)? / r.bounds.per_vehicle)
+    beside("per_vehicle_of_alone", "cost per vehicle / vehicles alone (rigorous)", 3, Pool::Mean, |r| {
+        Some(PER_VEHICLE.value(r)? / r.bounds.per_vehicle)
     }),
     TIME,
     ENERGY,
     measure("waits", "vehicles that waited outside", 1, Pool::Mean, |r| {
-        Some(r.sample.vehicles.iter().filter(|v| v.wait_s > 1e-9).count() as f64)
+        Some(r.vehicles.iter().filter(|v| v.wait_s > 1e-9).count() as f64)
     }),
     measure("wait_s", "wait outside per vehicle, s", 3, Pool::Mean, |r| mean(r, |v| v.wait_s)),
     measure("fuel_ml", "fuel per vehicle, ml", 2, Pool::Mean, |r| mean(r, |v| v.fuel_ml)),
     measure("jerk", "jerk, root mean square, m/s³", 2, Pool::Mean, |r| {
-        let time_s: f64 = r.sample.vehicles.iter().map(|v| v.time_s() - v.wait_s).sum();
-        let jerk: f64 = r.sample.vehicles.iter().map(|v| v.jerk).sum();
+        let time_s: f64 = r.vehicles.iter().map(|v| v.time_s() - v.wait_s).sum();
+        let jerk: f64 = r.vehicles.iter().map(|v| v.jerk).sum();
         (time_s > 0.0).then(|| (jerk / time_s).sqrt())
     }),
     measure("exposure", "exposure per vehicle, sum of zones, m·s", 3, Pool::Mean, |r| {
-        Some(r.sample.zones.iter().map(|z| z.exposure_ms).sum())
+        Some(r.zones.iter().map(|z| z.exposure_ms).sum())
     }),
-    measure("delay_sd_s", "delay against alone, standard deviation, s", 2, Pool::Mean, |r| {
+    beside("delay_sd_s", "delay against alone, standard deviation, s", 2, Pool::Mean, |r| {
         let delays: Vec<f64> = delays_s(r).collect();
         let mean = delays.iter().sum::<f64>() / delays.len() as f64;
         let square = delays.iter().map(|d| (d - mean) * (d - mean)).sum::<f64>() / delays.len() as f64;
         (!delays.is_empty()).then(|| square.sqrt())
     }),
-    measure("delay_greatest_s", "delay against alone, greatest of all runs, s", 2, Pool::Greatest, |r| {
+    beside("delay_greatest_s", "delay against alone, greatest of all runs, s", 2, Pool::Greatest, |r| {
         delays_s(r).max_by(f64::total_cmp)
     }),
     measure("throughput", "throughput, vehicles/h", 1, Pool::Mean, |r| {
-        let vehicles = &r.sample.vehicles;
+        let vehicles = &r.vehicles;
         let from_s = vehicles.iter().map(|v| v.entrant.arrival_s).min_by(f64::total_cmp)?;
         let exits = vehicles.iter().filter_map(|v| v.visits.last()).map(|visit| visit.exit_s);
         let to_s = exits.max_by(f64::total_cmp)?;
         Some(3600.0 * vehicles.len() as f64 / (to_s - from_s))
     }),
     measure("overlap_pairs", "pairs that overlapped, all runs", 0, Pool::Sum, |r| {
-        Some(r.sample.overlap_pairs as f64)
+        Some(r.overlap_pairs as f64)
     }),
-    measure("overlap_s", "overlapping, all runs, s", 2, Pool::Sum, |r| Some(r.sample.overlap_s)),
+    measure("overlap_s", "overlapping, all runs, s", 2, Pool::Sum, |r| Some(r.overlap_s)),
     measure("infeasible", "vehicles with an infeasible program, all runs", 0, Pool::Sum, |r| {
-        Some(r.sample.zones.iter().map(|z| f64::from(z.infeasible)).sum())
+        Some(r.zones.iter().map(|z| f64::from(z.infeasible)).sum())
     }),
     measure("enforced", "vehicles in feasibility enforcement", 1, Pool::Mean, |r| {
-        Some(r.sample.zones.iter().map(|z| f64::from(z.enforced)).sum())
+        Some(r.zones.iter().map(|z| f64::from(z.enforced)).sum())
     }),
     measure("out_of_order", "samples and passings out of order, all runs", 0, Pool::Sum, |r| {
-        Some(f64::from(r.sample.out_of_order))
+        Some(f64::from(r.out_of_order))
     }),
     measure("least_safe_rear_end_m", "least rear-end margin, entered safe, m", 3, Pool::Least, |r| {
-        least(r.sample.zones.iter().map(|z| z.least_safe_m[0]))
+        least(r.zones.iter().map(|z| z.least_safe_m[0]))
     }),
     measure("least_safe_merge_m", "least merging margin, entered safe, m", 3, Pool::Least, |r| {
-        least(r.sample.zones.iter().map(|z| z.least_safe_m[1]))
+        least(r.zones.iter().map(|z| z.least_safe_m[1]))
     }),
     measure("least_rear_end_m", "least rear-end margin, all, m", 3, Pool::Least, |r| {
-        least(r.sample.zones.iter().map(|z| z.least_m[0]))
+        least(r.zones.iter().map(|z| z.least_m[0]))
     }),
     measure("least_merge_m", "least merging margin, all, m", 3, Pool::Least, |r| {
-        least(r.sample.zones.iter().map(|z| z.least_m[1]))
+        least(r.zones.iter().map(|z| z.least_m[1]))
     }),
 ];
 

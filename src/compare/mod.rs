@@ -8,6 +8,7 @@ pub mod cli;
 pub mod figure;
 pub mod measure;
 pub mod policy;
+mod processes;
 pub mod report;
 pub mod sample;
 pub mod tables;
@@ -134,9 +135,14 @@ impl Performed<'_> {
         let argument = self.comparison.scenario.as_deref();
         let mut fresh = BTreeMap::new();
         let work = |(name, key): &(String, Key)| {
-            let scenario = load(argument, key)
+            let (seed, sets) = key;
+            let scenario = load(argument, *seed, sets)
                 .map_err(|source| CompareError::Scenario { name: name.clone(), source: Box::new(source) })?;
-            let sample = self.means.cache.sample(&scenario, name)?;
+            let sample = match scenario.plugins.is_empty() {
+                true => self.means.cache.sample(&scenario, name)?,
+                // What other programs have to do with it may change with them, so it is not kept.
+                false => processes::sample(argument, *seed, sets, name)?,
+            };
             Ok((scenario, sample))
         };
         parallel::each(self.means.jobs, &missing, work, |(_, key), result: (Arc<Scenario>, Sample)| {
@@ -149,9 +155,10 @@ impl Performed<'_> {
     }
 }
 
-fn load(argument: Option<&str>, (seed, sets): &Key) -> Result<Arc<Scenario>, ScenarioError> {
+/// A scenario with a seed and `--set`s.
+pub fn load(argument: Option<&str>, seed: u64, sets: &[String]) -> Result<Arc<Scenario>, ScenarioError> {
     let overrides = sets.iter().map(|set| set.parse()).collect::<Result<Vec<Override>, _>>()?;
-    Ok(Arc::new(scenario::load(argument, &overrides, Some(*seed))?))
+    Ok(Arc::new(scenario::load(argument, &overrides, Some(seed))?))
 }
 
 /// Compares. `progress` is told how many runs are done, of how many known so far.
@@ -165,7 +172,7 @@ pub fn run(
     }
     let mut performed = Performed { comparison, means, samples: BTreeMap::new(), total: 0 };
     let first = performed.key(comparison.seeds[0], Vec::new());
-    let base = load(comparison.scenario.as_deref(), &first)
+    let base = load(comparison.scenario.as_deref(), first.0, &first.1)
         .map_err(|source| CompareError::Scenario { name: "none".into(), source: Box::new(source) })?;
     let policies = comparison.policies.iter().map(|name| policy::find(name, &base.network));
     let policies: Vec<Policy> = policies.collect::<Result<_, _>>()?;
@@ -234,13 +241,14 @@ fn exit_speed(
     let seeds = &performed.comparison.seeds;
     let keys: Vec<Key> = seeds.iter().map(|&s| performed.key(s, baseline.sets.clone())).collect();
     performed.perform(keys.iter().map(|key| ("paper-none".to_owned(), key.clone())), progress)?;
-    let of = |key: &Key| {
-        let vehicles = &performed.samples[key].1.vehicles;
-        let exits = vehicles.iter().filter_map(|v| v.visits.last()).map(|visit| visit.exit_mps);
-        exits.sum::<f64>() / vehicles.len().max(1) as f64
-    };
-    let mean = keys.iter().map(of).sum::<f64>() / keys.len() as f64;
-    Ok((10.0 * mean).round() / 10.0)
+    let exits: Vec<f64> = keys.iter().map(|key| performed.samples[key].1.exit_mps()).collect();
+    Ok(measured_exit_mps(&exits))
+}
+
+/// The paper's terminal speed of zones that lead out, m/s, of the mean exit speeds of replicates without flow control.
+pub fn measured_exit_mps(exits_mps: &[f64]) -> f64 {
+    let mean = exits_mps.iter().sum::<f64>() / exits_mps.len() as f64;
+    (10.0 * mean).round() / 10.0
 }
 
 /// The rigorous bounds of the runs that were taken; runs with the same vehicles share them.

@@ -6,7 +6,7 @@
 use super::CompareError;
 use crate::reproduce::experiment::sweep_speeds;
 use crate::reproduce::paper::SECOND_TERMINAL_MPS;
-use crate::scenario::{Network, Zone};
+use crate::scenario::{self, Network, Zone};
 use serde::Deserialize;
 use std::path::Path;
 
@@ -30,6 +30,9 @@ struct Fragment {
     /// `--set`s in order.
     #[serde(default)]
     set: Vec<String>,
+    /// Controllers of one's own, TARGET=COMMAND as for `cz run --controller`.
+    #[serde(default)]
+    controllers: Vec<String>,
 }
 
 /// A policy as it is compared.
@@ -115,8 +118,9 @@ fn resolve(name: &str, network: &Network, depth: usize) -> Result<Policy, Compar
                 Some(from) => resolve(from, network, depth + 1)?.members,
                 None => vec![Member { sets: Vec::new(), measured: Vec::new() }],
             };
+            let declared = scenario::declaration(&fragment.controllers).map_err(bad)?;
             let members = members.into_iter().map(|mut member| {
-                member.sets.extend(fragment.set.iter().cloned());
+                member.sets.extend(fragment.set.iter().cloned().chain(declared.clone()));
                 member
             });
             Policy { name: name.to_owned(), about: fragment.about.clone(), members: members.collect() }

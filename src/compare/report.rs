@@ -242,7 +242,7 @@ fn result(policy: &Policy, own: &[Row], first: &[Row]) -> PolicyResult {
         }
     };
     let exposure = |zone: usize| move |row: &Row| Some(row.sample.zones[zone].exposure_ms);
-    let mut differences: Vec<Difference> = MEASURES.iter().map(|m| pair(m.id, &m.of)).collect();
+    let mut differences: Vec<Difference> = MEASURES.iter().map(|m| pair(m.id, &|row| m.value(row))).collect();
     differences
         .extend(names.iter().enumerate().map(|(at, name)| pair(&format!("exposure {name}"), &exposure(at))));
     PolicyResult {
@@ -252,7 +252,7 @@ fn result(policy: &Policy, own: &[Row], first: &[Row]) -> PolicyResult {
         taken: own.iter().map(|row| row.member).collect(),
         zones: per_zone(&|row, zone| complete(row, row.sample.zone_costs()[zone])),
         exposures: per_zone(&|row, zone| Some(row.sample.zones[zone].exposure_ms)),
-        measures: MEASURES.iter().map(|m| (m.id, over(&m.of, m.pool))).collect(),
+        measures: MEASURES.iter().map(|m| (m.id, over(&|row| m.value(row), m.pool))).collect(),
         differences,
     }
 }

@@ -3,19 +3,23 @@
 use crate::bounds::Entrant;
 use crate::bounds::joint::Course;
 use crate::lockstep::in_process::InProcess;
+use crate::record::{Reader, WorldReplay};
 use crate::reproduce::ReproduceError;
 use crate::reproduce::runs::drive;
 use crate::scenario::arrivals::ArrivalStream;
 use crate::scenario::{Scenario, Source};
 use crate::world::World;
-use ipc_schemas::{NO_ZONE, STATE_LEFT};
+use ipc_schemas::{FLAG_END_OF_RUN, NO_ZONE, STATE_LEFT};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, HashMap};
+use std::path::Path;
 use std::sync::Arc;
 
 /// What one run of a policy showed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Sample {
+    /// Over all frames of the run.
+    pub state_hash: u64,
     /// Weight of time, m^2/s^4.
     pub beta: f64,
     /// Whether every vehicle got through.
@@ -110,6 +114,12 @@ impl Sample {
         if self.complete { self.zone_costs().iter().sum() } else { f64::NAN }
     }
 
+    /// Mean speed at which vehicles left, m/s.
+    pub fn exit_mps(&self) -> f64 {
+        let exits = self.vehicles.iter().filter_map(|v| v.visits.last()).map(|visit| visit.exit_mps);
+        exits.sum::<f64>() / self.vehicles.len().max(1) as f64
+    }
+
     /// When each vehicle passed what, in order of number.
     pub fn courses(&self) -> Vec<Vec<Course>> {
         let course = |v: &VisitSample| Course { entry_s: v.entry_s, exit_s: v.exit_s, exit_mps: v.exit_mps };
@@ -132,6 +142,27 @@ impl Sample {
         let mut observer = Observer::default();
         let complete = drive(&mut run, scenario, |world| observer.see(world)).map_err(failed)?;
         Ok(observer.sample(run.world(), complete))
+    }
+
+    /// What a recorded run showed: the world, brought on by the recorded commands, is looked at as it would be in the run.
+    ///
+    /// # Errors
+    /// Why it cannot be told: the file is none, it is damaged, or the world comes out elsewhere.
+    pub fn recorded(path: &Path) -> Result<Sample, String> {
+        let reader = Reader::open(path).map_err(|error| error.to_string())?;
+        let mut replay = WorldReplay::new(&reader);
+        replay.record_visits();
+        let mut observer = Observer::default();
+        for step in reader.steps() {
+            let step = step.map_err(|damage| damage.to_string())?;
+            replay.take(&step).map_err(|error| error.to_string())?;
+            if step.header.flags & FLAG_END_OF_RUN == 0 {
+                observer.see(replay.world());
+            }
+        }
+        let summary = replay.world().summary();
+        let complete = summary.arrived == summary.departed && summary.waiting == 0;
+        Ok(observer.sample(replay.world(), complete))
     }
 }
 
@@ -210,6 +241,7 @@ impl Observer {
             least_m: [z.min_rear_end_margin_m, z.min_merge_margin_m],
         });
         Sample {
+            state_hash: world.state_hash(),
             beta: scenario.beta,
             complete,
             zones: zones.collect(),

@@ -23,6 +23,41 @@ impl Plugin {
     }
 }
 
+/// The `--set` that declares controllers given as TARGET=COMMAND, TARGET being zones and paths such as
+/// `merge-1,merge-2.main`; none when there are none.
+///
+/// # Errors
+/// What is expected in place of one that is not of this form.
+pub fn declaration(controllers: &[String]) -> Result<Option<String>, String> {
+    let quote = |text: &str| toml::Value::String(text.to_owned()).to_string();
+    let declared = controllers.iter().map(|text| {
+        let (target, command) = target_and_command(text)?;
+        let (paths, zones): (Vec<_>, Vec<_>) = target.split(',').partition(|t| t.contains('.'));
+        let list = |key: &str, items: &[&str]| match items {
+            [] => String::new(),
+            _ => format!("{key} = [{}], ", items.iter().map(|i| quote(i)).collect::<Vec<_>>().join(", ")),
+        };
+        Ok(format!(
+            "{{name = {}, {}{}command = {}}}",
+            quote(&target.replace('.', "-").replace(',', "_")),
+            list("zones", &zones),
+            list("paths", &paths),
+            quote(command)
+        ))
+    });
+    let declared = declared.collect::<Result<Vec<String>, String>>()?;
+    Ok((!declared.is_empty()).then(|| format!("controllers=[{}]", declared.join(", "))))
+}
+
+/// The two parts of TARGET=COMMAND.
+///
+/// # Errors
+/// What is expected in place of something else.
+pub fn target_and_command(text: &str) -> Result<(&str, &str), String> {
+    let parts = text.split_once('=').filter(|(target, command)| !target.is_empty() && !command.is_empty());
+    parts.ok_or_else(|| format!("{text}: expected TARGET=COMMAND, such as merge-2=\"python3 mine.py\""))
+}
+
 /// What the actuation gateway does with commands that are not safe.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
