@@ -14,8 +14,13 @@ use std::process::Command;
 /// Folders with nothing of ours in them, or nothing that documents speak of.
 const SKIPPED: [&str; 4] = ["target", ".git", "__pycache__", "build"];
 /// Subcommands that other programs of this workspace have, and where these are.
-const SIBLINGS: [(&str, &str); 4] =
-    [("export", "export/src"), ("report", "export/src"), ("top", "view/src"), ("view", "view/src")];
+const SIBLINGS: [(&str, &str); 5] = [
+    ("export", "export/src"),
+    ("report", "export/src"),
+    ("sweep", "sweep/src"),
+    ("top", "view/src"),
+    ("view", "view/src"),
+];
 /// Flags that documents say there is not.
 const NOT_THERE: [&str; 1] = ["--isolate"];
 /// Names of other people's code.

@@ -15,7 +15,8 @@ from pathlib import Path
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/python/cruise.py"
 ENVIRONMENTS = Path(__file__).resolve().with_name("check_env.py")
-PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-view", "cz-top")
+SWEEPS = Path(__file__).resolve().with_name("check_sweep.py")
+PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-sweep", "cz-view", "cz-top")
 
 
 class Empty:
@@ -71,6 +72,9 @@ def check(wheel: Path, place: Path) -> None:
     empty.ran("what environments need installed", *install, f"{wheel}[env]")
     # Isolated: what lies beside the script is not what was installed.
     print(empty.ran("the environments' checkers", "python", "-I", str(ENVIRONMENTS)), end="")
+    empty.ran("cz sweep of 20 runs", "cz", "sweep", "paper-none", "--scenario", "paper", "--seeds", "20")
+    empty.ran("what sweeps on a cluster need installed", *install, f"{wheel}[dask]")
+    print(empty.ran("the same sweep by cz and by Dask", "python", "-I", str(SWEEPS)), end="")
     for program in ("cz-view", "cz-top", "cz-world", "cz-coord", "cz-ctrl"):
         empty.ran(f"{program} --help", program, "--help")
 

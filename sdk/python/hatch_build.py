@@ -18,7 +18,7 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 #: What `control_zones.env` loads.
 LIBRARY = "libcontrol_zones_env.so"
-PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-view", "cz-top")
+PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-sweep", "cz-view", "cz-top")
 
 
 class Programs(BuildHookInterface):  # type: ignore[type-arg]

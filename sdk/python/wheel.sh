@@ -8,9 +8,11 @@ out=${1:-target/wheels}
 if [ -z "${CZ_PROGRAMS:-}" ]; then
     cargo build --release --workspace --bins
     cargo build --release -p control-zones-env
-    CZ_PROGRAMS=$(realpath "${CARGO_TARGET_DIR:-target}/release")
-    export CZ_PROGRAMS
+    CZ_PROGRAMS=${CARGO_TARGET_DIR:-target}/release
 fi
+# It is built elsewhere.
+CZ_PROGRAMS=$(realpath "$CZ_PROGRAMS")
+export CZ_PROGRAMS
 rm -f "$out"/control_zones-*.whl
 "${CZ_PYTHON:-python3}" -m pip --disable-pip-version-check wheel --quiet --no-deps --wheel-dir "$out" ./sdk/python
 ls -l "$out"/control_zones-*-manylinux_*.whl

@@ -151,6 +151,7 @@ pub fn cz() -> ExitCode {
             args::Command::Bench(args) => bench::bench(&args),
             args::Command::Plugin { command } => plugin::plugin(&command),
             args::Command::Sdk { command } => sdk::sdk(&command),
+            args::Command::Sweep(args) => sibling::SWEEP.run(&args.arguments),
             args::Command::Export(args) => sibling::EXPORT.run(&args.arguments),
             args::Command::Report(args) => sibling::REPORT.run(&args.arguments),
             args::Command::View(args) => sibling::VIEW.run(&args.arguments),

@@ -20,6 +20,8 @@ pub(super) const VIEW: Sibling = Sibling { program: "cz-view", package: "cz-view
 pub(super) const TOP: Sibling = Sibling { program: "cz-top", package: "cz-view" };
 /// `cz export`.
 pub(super) const EXPORT: Sibling = Sibling { program: "cz-export", package: "cz-export" };
+/// `cz sweep`.
+pub(super) const SWEEP: Sibling = Sibling { program: "cz-sweep", package: "cz-sweep" };
 /// `cz report`.
 pub(super) const REPORT: Sibling = Sibling { program: "cz-report", package: "cz-export" };
 

@@ -73,6 +73,9 @@ pub(super) enum Command {
         #[command(subcommand)]
         command: PluginCommand,
     },
+    /// Run policies by scenarios by seeds into one Parquet table (the program cz-sweep).
+    #[command(disable_help_flag = true, disable_version_flag = true)]
+    Sweep(SiblingArgs),
     /// Write a recording in the formats of other tools (the program cz-export).
     #[command(disable_help_flag = true, disable_version_flag = true)]
     Export(SiblingArgs),
