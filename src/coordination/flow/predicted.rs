@@ -7,8 +7,8 @@
 
 use crate::control::Terminal;
 use crate::control::reference::Problem;
-use crate::coordination::schedule::cost::{Convex, Cost, Single};
-use crate::coordination::schedule::pooling::root;
+use crate::coordination::schedule::cost::{Cost, Single};
+use crate::coordination::schedule::pooling::best_s;
 use crate::scenario::{Exit, ReferenceLaw, Scenario, Zone};
 use ipc_schemas::{VehicleState, ZoneSummary};
 
@@ -74,8 +74,7 @@ impl Prediction {
     fn cost<'a>(&self, own: impl Iterator<Item = &'a VehicleState>, speed_mps: f64, ahead: f64) -> f64 {
         let headway_s = self.reaction_s + self.gap_m / speed_mps;
         let next = Cost::Single(Single { beta: self.beta, left_m: self.downstream_m, v_mps: speed_mps });
-        let (from, to) = next.bracket_s();
-        let crossing_s = root(|t| next.slope(t), from, to);
+        let crossing_s = best_s(&next);
         let (mut left_s, mut out_s) = (f64::NEG_INFINITY, headway_s * ahead);
         let mut total = 0.0;
         for state in own {

@@ -83,14 +83,18 @@ impl Chain {
         self.alone_s.extend(costs.iter().map(best_s));
         self.times_s.clear();
         self.times_s.extend(self.alone_s.iter().zip(own).map(|(alone_s, own)| alone_s.max(own.soonest_s())));
-        for _ in 0..ROUNDS {
+        for round in 0..ROUNDS {
             self.before_s.clone_from(&self.times_s);
             self.speeds_mps.clear();
             let times = self.times_s.iter();
             self.speeds_mps.extend(costs.iter().zip(own).zip(times).map(|((c, p), &t)| speed(c, p, t)));
             self.separate(passages, duties, known);
             let Chain { pooling, headways, alone_s, earliest_s, before_s, times_s, .. } = self;
-            pooling.minimise(costs, alone_s, earliest_s, headways, times_s);
+            if round == 0 {
+                pooling.minimise(costs, alone_s, earliest_s, headways, times_s);
+            } else {
+                pooling.minimise_again(costs, alone_s, earliest_s, headways, times_s);
+            }
             // From the same instants the same would come out again.
             if times_s == before_s {
                 break;

@@ -27,9 +27,14 @@ impl Single {
         if self.v_mps > 0.0 { CONVEX_UNTIL * self.left_m / self.v_mps } else { f64::INFINITY }
     }
 
-    fn slope_at(&self, t: f64) -> f64 {
+    fn slope_at(&self, t: f64) -> Slope {
         let Single { beta, left_m: l, v_mps: v } = *self;
-        beta - 1.5 * (l - v * t) * (3.0 * l - v * t) / (t * t * t * t)
+        let per_t4 = 1.0 / (t * t * t * t);
+        let way = v * t;
+        Slope {
+            value: beta - 1.5 * (l - way) * (3.0 * l - way) * per_t4,
+            rise: 3.0 * (6.0 * l * (l - way) + way * way) * per_t4 / t,
+        }
     }
 
     /// Speed at the end, m/s.
@@ -92,18 +97,49 @@ impl Tandem {
         self.first_beta * t1_s + self.second_beta * t2_s + first + self.weight * second
     }
 
-    /// `dF / dT1`.
-    pub fn slope_first(&self, t1_s: f64, t2_s: f64) -> f64 {
-        let tau = t2_s - t1_s;
-        let m = self.motion(t1_s, t2_s);
-        let (u0, u1, weight) = (m.u0_mps2, m.u1_mps2, self.weight);
-        self.first_beta - 0.5 * u1 * u1 * (1.0 - 1.0 / weight) + ((u1 - u0) / t1_s + u1 / tau) * m.v1_mps
+    /// `dF / dT1`, and how it rises with T1.
+    pub fn slope_first(&self, t1_s: f64, t2_s: f64) -> Slope {
+        let Tandem { weight, first_m, second_m, v_mps: v, .. } = *self;
+        let (per_t1, tau) = (1.0 / t1_s, t2_s - t1_s);
+        let per_tau = 1.0 / tau;
+        let per_weight = 1.0 / weight;
+        // What comes behind `d_` is the derivative by T1.
+        let a = 1.5 * first_m * per_t1 - 0.5 * v;
+        let d_a = -1.5 * first_m * per_t1 * per_t1;
+        let per_denominator = 1.0 / (tau * tau * per_weight + 0.75 * tau * t1_s);
+        let d_denominator = -2.0 * tau * per_weight + 0.75 * (tau - t1_s);
+        let u1 = 3.0 * (second_m - a * tau) * per_denominator;
+        let d_u1 = (3.0 * (a - d_a * tau) - u1 * d_denominator) * per_denominator;
+        let short = 3.0 * (first_m - v * t1_s) * per_t1 * per_t1;
+        let u0 = short - 0.5 * u1;
+        let d_u0 = -3.0 * v * per_t1 * per_t1 - 2.0 * short * per_t1 - 0.5 * d_u1;
+        let v1 = a + 0.25 * u1 * t1_s;
+        let d_v1 = d_a + 0.25 * (d_u1 * t1_s + u1);
+        let bend = (u1 - u0) * per_t1 + u1 * per_tau;
+        let d_bend = (d_u1 - d_u0 - (u1 - u0) * per_t1) * per_t1 + (d_u1 + u1 * per_tau) * per_tau;
+        let lost = 1.0 - per_weight;
+        Slope {
+            value: self.first_beta - 0.5 * u1 * u1 * lost + bend * v1,
+            rise: -u1 * d_u1 * lost + d_bend * v1 + bend * d_v1,
+        }
     }
 
-    /// `dF / dT2`.
-    pub fn slope_second(&self, t1_s: f64, t2_s: f64) -> f64 {
-        let m = self.motion(t1_s, t2_s);
-        self.second_beta - m.u1_mps2 * m.v2_mps / (t2_s - t1_s)
+    /// `dF / dT2`, and how it rises with T2.
+    pub fn slope_second(&self, t1_s: f64, t2_s: f64) -> Slope {
+        let Tandem { weight, first_m, second_m, v_mps: v, .. } = *self;
+        let tau = t2_s - t1_s;
+        let per_tau = 1.0 / tau;
+        let per_weight = 1.0 / weight;
+        let a = 1.5 * first_m / t1_s - 0.5 * v;
+        let per_denominator = 1.0 / (tau * tau * per_weight + 0.75 * tau * t1_s);
+        let u1 = 3.0 * (second_m - a * tau) * per_denominator;
+        let d_u1 = (-3.0 * a - u1 * (2.0 * tau * per_weight + 0.75 * t1_s)) * per_denominator;
+        let v2 = a + 0.25 * u1 * t1_s + 0.5 * u1 * tau * per_weight;
+        let d_v2 = 0.25 * d_u1 * t1_s + 0.5 * (d_u1 * tau + u1) * per_weight;
+        Slope {
+            value: self.second_beta - u1 * v2 * per_tau,
+            rise: (u1 * v2 * per_tau - d_u1 * v2 - u1 * d_v2) * per_tau,
+        }
     }
 }
 
@@ -118,10 +154,45 @@ pub enum Cost {
     Second(Tandem, f64),
 }
 
+/// The slope of a cost at one instant.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Slope {
+    /// The slope itself.
+    pub value: f64,
+    /// Its own slope there; 0 where it is not known.
+    pub rise: f64,
+}
+
+impl Slope {
+    /// A slope that stays the same around.
+    const fn held(value: f64) -> Slope {
+        Slope { value, rise: 0.0 }
+    }
+
+    /// The same within what sums can bear.
+    fn bounded(self) -> Slope {
+        if self.value.abs() < STEEP { self } else { Slope::held(self.value.clamp(-STEEP, STEEP)) }
+    }
+}
+
+impl std::ops::Add for Slope {
+    type Output = Slope;
+
+    fn add(self, other: Slope) -> Slope {
+        Slope { value: self.value + other.value, rise: self.rise + other.rise }
+    }
+}
+
+impl std::iter::Sum for Slope {
+    fn sum<I: Iterator<Item = Slope>>(all: I) -> Slope {
+        all.fold(Slope::held(0.0), std::ops::Add::add)
+    }
+}
+
 /// A function to be minimised of which only the slope is needed; the slope rises.
 pub trait Convex {
     /// The slope.
-    fn slope(&self, t_s: f64) -> f64;
+    fn slope(&self, t_s: f64) -> Slope;
 
     /// Two instants between which the slope passes 0.
     fn bracket_s(&self) -> (f64, f64);
@@ -136,7 +207,7 @@ impl Cost {
                 let t = t_s.min(single.held_from_s());
                 let short = single.left_m - single.v_mps * t;
                 let convex = single.beta * t + 1.5 * short * short / (t * t * t);
-                convex + (t_s - t) * single.slope_at(t)
+                convex + (t_s - t) * single.slope_at(t).value
             }
             Cost::First(tandem, t2) => tandem.value(t_s, *t2),
             Cost::Second(tandem, t1) => tandem.value(*t1, t_s),
@@ -154,15 +225,18 @@ impl Cost {
 }
 
 impl Convex for Cost {
-    fn slope(&self, t_s: f64) -> f64 {
+    fn slope(&self, t_s: f64) -> Slope {
         match self {
-            Cost::Single(_) if t_s <= 0.0 => -STEEP,
-            Cost::Single(single) => single.slope_at(t_s.min(single.held_from_s())),
-            Cost::First(..) if t_s <= 0.0 => -STEEP,
-            Cost::First(_, t2) if t_s >= *t2 => STEEP,
-            Cost::First(tandem, t2) => tandem.slope_first(t_s, *t2).clamp(-STEEP, STEEP),
-            Cost::Second(_, t1) if t_s <= *t1 => -STEEP,
-            Cost::Second(tandem, t1) => tandem.slope_second(*t1, t_s).clamp(-STEEP, STEEP),
+            Cost::Single(_) if t_s <= 0.0 => Slope::held(-STEEP),
+            Cost::Single(single) => {
+                let held_s = single.held_from_s();
+                if t_s < held_s { single.slope_at(t_s) } else { Slope::held(single.slope_at(held_s).value) }
+            }
+            Cost::First(..) if t_s <= 0.0 => Slope::held(-STEEP),
+            Cost::First(_, t2) if t_s >= *t2 => Slope::held(STEEP),
+            Cost::First(tandem, t2) => tandem.slope_first(t_s, *t2).bounded(),
+            Cost::Second(_, t1) if t_s <= *t1 => Slope::held(-STEEP),
+            Cost::Second(tandem, t1) => tandem.slope_second(*t1, t_s).bounded(),
         }
     }
 

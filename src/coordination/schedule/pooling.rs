@@ -6,7 +6,7 @@
 //! a multiplier is negative: the active-set method for separation constraints of Dwyer, Marriott and Stuckey ("Fast node
 //! overlap removal", 2005), here for any convex J_i.
 
-use super::cost::Convex;
+use super::cost::{Convex, Slope};
 
 /// `T_after >= T_before + headway`; vehicles by index in the passing order.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -21,6 +21,8 @@ pub struct Headway {
 
 /// Violations below this do not count, s.
 const TOLERANCE_S: f64 = 1e-11;
+/// Within a block, whose instants are sums, s.
+const WITHIN_TOLERANCE_S: f64 = 1e-9;
 /// Multipliers above this count as zero.
 const TOLERANCE_SLOPE: f64 = 1e-9;
 
@@ -35,9 +37,36 @@ pub struct Pooling {
     at_s: Vec<f64>,
     /// Whether a headway holds its block together.
     is_active: Vec<bool>,
-    slopes: Vec<f64>,
+    /// The headways of the program solved last.
+    last: Vec<Headway>,
+    /// The instants found last, s.
+    old_s: Vec<f64>,
+    parts: Vec<Part>,
+    wholes: Vec<Whole>,
+    /// Active headways that were not looked at.
+    open: Vec<bool>,
     side: Vec<bool>,
     stack: Vec<u32>,
+}
+
+/// A vehicle, and those that hang on it by headways that were looked at already.
+#[derive(Clone, Copy, Debug)]
+struct Part {
+    /// What their slopes sum up to.
+    slope: f64,
+    /// Whether the block's bearer is among them.
+    is_bearing: bool,
+    /// Its active headways that were not looked at.
+    ties: u32,
+}
+
+/// A block.
+#[derive(Clone, Copy, Debug)]
+struct Whole {
+    /// What its vehicles' slopes sum up to.
+    slope: f64,
+    /// The earliest instant it may have, s, and the vehicle this is due to: its bearer.
+    earliest: (f64, u32),
 }
 
 /// A program.
@@ -76,14 +105,102 @@ impl Pooling {
         if !is_chain(headways) {
             self.split_where_it_pays(&program);
         }
+        self.finish(&program, times_s);
+    }
+
+    /// The same, begun from the blocks of the program solved last where this one has headways between the same
+    /// vehicles: for those that differ little.
+    pub fn minimise_again<C: Convex>(
+        &mut self,
+        costs: &[C],
+        alone_s: &[f64],
+        earliest_s: &[f64],
+        headways: &[Headway],
+        times_s: &mut Vec<f64>,
+    ) {
+        let between = |h: &Headway| (h.before, h.after);
+        if costs.len() != self.block.len() || !headways.iter().map(between).eq(self.last.iter().map(between))
+        {
+            return self.minimise(costs, alone_s, earliest_s, headways, times_s);
+        }
+        let program = Program { costs, earliest_s, headways };
+        self.place_blocks_again(&program, alone_s);
+        let all = headways.len();
+        let apart = |own: &Pooling, h: &Headway| own.block[h.before as usize] != own.block[h.after as usize];
+        while let Some(h) = headways.iter().find(|h| apart(self, h) && self.lack_s(h) > TOLERANCE_S) {
+            // Each merge makes one block of two.
+            let block = self.block[h.after as usize];
+            self.merge(&program, all, block, Side::Before);
+        }
+        self.split_where_it_pays(&program);
+        // Blocks that were not merged in passing order may lack headways within.
+        if headways.iter().any(|h| self.lack_s(h) > WITHIN_TOLERANCE_S) {
+            return self.minimise(costs, alone_s, earliest_s, headways, times_s);
+        }
+        self.finish(&program, times_s);
+    }
+
+    /// Moves the blocks there are, whose headways have changed, to their best instants.
+    fn place_blocks_again<C: Convex>(&mut self, program: &Program<'_, C>, alone_s: &[f64]) {
+        self.old_s.clear();
+        self.old_s
+            .extend((0..self.block.len()).map(|i| self.at_s[self.block[i] as usize] + self.offset_s[i]));
+        self.side.clear();
+        self.side.resize(self.block.len(), false);
+        for first in 0..self.block.len() {
+            if !self.side[first] {
+                self.measure(program, first as u32);
+            }
+        }
+        for block in 0..self.block.len() as u32 {
+            if self.block[block as usize] == block {
+                let own = self.members(block).map(|i| alone_s[i] - self.offset_s[i]);
+                let (from, to) =
+                    own.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), s| (a.min(s), b.max(s)));
+                self.place(program, block, self.at_s[block as usize], from, to);
+            }
+        }
+    }
+
+    /// Names a block by its first vehicle and works out the offsets in it.
+    fn measure<C>(&mut self, program: &Program<'_, C>, first: u32) {
+        self.side[first as usize] = true;
+        self.offset_s[first as usize] = 0.0;
+        self.at_s[first as usize] = self.old_s[first as usize];
+        self.stack.push(first);
+        while let Some(at) = self.stack.pop() {
+            self.block[at as usize] = first;
+            for (h, _) in program.headways.iter().zip(&self.is_active).filter(|(_, active)| **active) {
+                let (other, away_s) = match (h.before == at, h.after == at) {
+                    (true, _) => (h.after, h.headway_s),
+                    (_, true) => (h.before, -h.headway_s),
+                    _ => continue,
+                };
+                if !std::mem::replace(&mut self.side[other as usize], true) {
+                    self.offset_s[other as usize] = self.offset_s[at as usize] + away_s;
+                    self.stack.push(other);
+                }
+            }
+        }
+    }
+
+    /// Writes down the instants found.
+    fn finish<C>(&mut self, program: &Program<'_, C>, times_s: &mut Vec<f64>) {
         times_s.clear();
-        times_s.extend((0..count).map(|i| self.time_s(i)));
+        times_s.extend((0..self.block.len()).map(|i| self.time_s(i)));
         // Rounding, and what the bound on splits may have left.
-        for h in headways {
+        for h in program.headways {
             let least = times_s[h.before as usize] + h.headway_s;
             let time = &mut times_s[h.after as usize];
             *time = time.max(least);
         }
+        self.last.clear();
+        self.last.extend_from_slice(program.headways);
+    }
+
+    /// By how much a headway is violated, s.
+    fn lack_s(&self, h: &Headway) -> f64 {
+        self.time_s(h.before as usize) + h.headway_s - self.time_s(h.after as usize)
     }
 
     fn time_s(&self, vehicle: usize) -> f64 {
@@ -109,7 +226,7 @@ impl Pooling {
                 if own != block || other == block {
                     continue;
                 }
-                let lack_s = self.time_s(before) + h.headway_s - self.time_s(after);
+                let lack_s = self.lack_s(h);
                 if lack_s > TOLERANCE_S && worst.is_none_or(|(_, most)| lack_s > most) {
                     worst = Some((at, lack_s));
                 }
@@ -133,22 +250,20 @@ impl Pooling {
         self.is_active[at] = true;
         // The best instant of the whole lies between those of its parts.
         let (a, b) = (self.at_s[first as usize], self.at_s[second as usize] - shift_s);
-        self.place(program, first, a.min(b), a.max(b));
+        self.place(program, first, 0.5 * (a + b), a.min(b), a.max(b));
         first
     }
 
-    /// Moves a block to its best instant, which is within the bracket.
-    fn place<C: Convex>(&mut self, program: &Program<'_, C>, block: u32, from: f64, to: f64) {
-        let slope =
-            |at: f64| self.members(block).map(|i| program.costs[i].slope(at + self.offset_s[i])).sum::<f64>();
-        let best = root(slope, from, to);
-        self.at_s[block as usize] = best.max(self.earliest(program, block).0);
+    /// Moves a block to its best instant, which is within the bracket and sought from `start`.
+    fn place<C: Convex>(&mut self, program: &Program<'_, C>, block: u32, start: f64, from: f64, to: f64) {
+        let best = root(|at| self.slope(program, block, at), start, from, to);
+        let earliest = self.members(block).map(|i| program.earliest_s[i] - self.offset_s[i]);
+        self.at_s[block as usize] = earliest.fold(best, f64::max);
     }
 
-    /// The earliest instant of a block, and the vehicle it is due to.
-    fn earliest<C>(&self, program: &Program<'_, C>, block: u32) -> (f64, usize) {
-        let own = self.members(block).map(|i| (program.earliest_s[i] - self.offset_s[i], i));
-        own.fold((f64::NEG_INFINITY, usize::MAX), |most, each| if each.0 > most.0 { each } else { most })
+    /// What the slopes of a block sum up to when it is at that instant.
+    fn slope<C: Convex>(&self, program: &Program<'_, C>, block: u32, at_s: f64) -> Slope {
+        self.members(block).map(|i| program.costs[i].slope(at_s + self.offset_s[i])).sum()
     }
 
     /// Splits blocks at headways that hold vehicles together which would rather be apart, until there are none.
@@ -173,16 +288,13 @@ impl Pooling {
             for part in [block, new] {
                 let least = self.members(part).map(|i| self.offset_s[i]).fold(f64::INFINITY, f64::min);
                 let mut to = kept + 1.0;
-                let slope = |at: f64| {
-                    self.members(part).map(|i| program.costs[i].slope(at + self.offset_s[i])).sum::<f64>()
-                };
                 for _ in 0..20 {
-                    if slope(to) >= 0.0 {
+                    if self.slope(program, part, to).value >= 0.0 {
                         break;
                     }
                     to += 2.0 * (to - kept);
                 }
-                self.place(program, part, -least, to);
+                self.place(program, part, kept, -least, to);
             }
             let all = program.headways.len();
             self.merge(program, all, block, Side::Before);
@@ -195,34 +307,65 @@ impl Pooling {
     }
 
     /// The active headway with the most negative multiplier, and its block.
+    ///
+    /// A block is a tree of active headways. The multiplier of each is what the slopes on one side of it sum up to, and
+    /// the sides are found by taking off vehicles at the ends of the tree, one after the other.
     fn least_wanted<C: Convex>(&mut self, program: &Program<'_, C>) -> Option<(usize, u32)> {
-        self.slopes.clear();
-        for i in 0..program.costs.len() {
-            self.slopes.push(program.costs[i].slope(self.time_s(i)));
-        }
+        self.weigh(program);
+        self.open.clone_from(&self.is_active);
+        self.stack.clear();
+        self.stack.extend((0..self.parts.len() as u32).filter(|&i| self.parts[i as usize].ties == 1));
         let mut least: Option<(usize, f64)> = None;
-        for at in 0..program.headways.len() {
-            if !self.is_active[at] {
-                continue;
-            }
-            let before = program.headways[at].before;
-            let block = self.block[before as usize];
-            self.is_active[at] = false;
-            self.mark(program, before);
-            self.is_active[at] = true;
+        while let Some(end) = self.stack.pop() {
+            let ties = |(at, h): &(usize, &Headway)| self.open[*at] && (h.before == end || h.after == end);
+            let Some((at, h)) = program.headways.iter().enumerate().find(ties) else { continue };
+            self.open[at] = false;
+            let part = self.parts[end as usize];
+            let whole = self.wholes[self.block[end as usize] as usize];
+            let rest = whole.slope - part.slope;
+            let is_before = h.before == end;
+            let (first, second) = if is_before { (part.slope, rest) } else { (rest, part.slope) };
             // What is wrong with the sum of the slopes, whoever may not be earlier bears.
-            let (earliest, bearer) = self.earliest(program, block);
-            let is_held = self.at_s[block as usize] <= earliest;
-            let (mut first, mut second) = (0.0, 0.0);
-            for i in self.members(block) {
-                *(if self.side[i] { &mut first } else { &mut second }) += self.slopes[i];
-            }
-            let multiplier = if is_held && self.side[bearer] { second } else { -first };
+            let is_held = self.at_s[self.block[end as usize] as usize] <= whole.earliest.0;
+            let multiplier = if is_held && part.is_bearing == is_before { second } else { -first };
             if multiplier < -TOLERANCE_SLOPE && least.is_none_or(|(_, most)| multiplier < most) {
                 least = Some((at, multiplier));
             }
+            let other = if is_before { h.after } else { h.before };
+            let hangs_on = &mut self.parts[other as usize];
+            hangs_on.slope += part.slope;
+            hangs_on.is_bearing |= part.is_bearing;
+            hangs_on.ties -= 1;
+            if hangs_on.ties == 1 {
+                self.stack.push(other);
+            }
         }
         least.map(|(at, _)| (at, self.block[program.headways[at].before as usize]))
+    }
+
+    /// Works out the slopes of vehicles and blocks where they are.
+    fn weigh<C: Convex>(&mut self, program: &Program<'_, C>) {
+        self.parts.clear();
+        self.wholes.clear();
+        let none = Whole { slope: 0.0, earliest: (f64::NEG_INFINITY, 0) };
+        self.wholes.resize(self.block.len(), none);
+        for (i, cost) in program.costs.iter().enumerate() {
+            let slope = cost.slope(self.time_s(i)).value;
+            self.parts.push(Part { slope, is_bearing: false, ties: 0 });
+            let whole = &mut self.wholes[self.block[i] as usize];
+            whole.slope += slope;
+            let earliest_s = program.earliest_s[i] - self.offset_s[i];
+            if earliest_s > whole.earliest.0 {
+                whole.earliest = (earliest_s, i as u32);
+            }
+        }
+        for (i, block) in self.block.iter().enumerate() {
+            self.parts[i].is_bearing = self.wholes[*block as usize].earliest.1 == i as u32;
+        }
+        for (h, _) in program.headways.iter().zip(&self.is_active).filter(|(_, active)| **active) {
+            self.parts[h.before as usize].ties += 1;
+            self.parts[h.after as usize].ties += 1;
+        }
     }
 
     /// Marks whom active headways connect with a vehicle.
@@ -261,81 +404,70 @@ pub fn is_chain(headways: &[Headway]) -> bool {
         .all(|(at, h)| headways[..at].iter().all(|other| other.before != h.before && other.after != h.after))
 }
 
-/// Steps of the search for a root; each third one halves the bracket.
+/// Steps of the search for a root.
 const STEPS: u32 = 120;
 /// Width at which a bracket counts as closed, relative to where it is.
 const CLOSED: f64 = 1e-14;
-/// The search ends when it has come to the same place twice, to this share of it, and the root is no further away.
-const FOUND: f64 = 1e-12;
+/// A step of Newton's method that is shorter than this share of where it leads is the last: what it leaves is of the
+/// order of its square.
+const FOUND: f64 = 1e-8;
+/// If it is also shorter than this share of the one before.
+const SHRINKING: f64 = 0.1;
 
 /// Where a cost is least.
 pub fn best_s(cost: &impl Convex) -> f64 {
     let (from, to) = cost.bracket_s();
-    root(|t| cost.slope(t), from, to)
+    root(|t| cost.slope(t), 0.5 * (from + to), from, to)
 }
 
 /// Where a rising function passes 0 within a bracket; an end of it when it does not.
 ///
-/// Regula falsi with the Illinois rule, and halving now and then: the same steps on every machine.
-pub fn root(f: impl Fn(f64) -> f64, from: f64, to: f64) -> f64 {
+/// Newton's method from `start`, which halves the bracket where it would leave it or comes no nearer: the same steps on every
+/// machine.
+pub fn root(f: impl Fn(f64) -> Slope, start: f64, from: f64, to: f64) -> f64 {
     let (mut low, mut high) = (from, to);
-    let (mut f_low, mut f_high) = (f(low), f(high));
-    if f_low >= 0.0 {
-        return low;
-    }
-    if f_high <= 0.0 {
-        return high;
-    }
-    let (mut last, mut before) = (0, f64::NAN);
-    for step in 1..=STEPS {
-        let width = high - low;
-        if width <= CLOSED * high.abs().max(low.abs()) {
-            break;
-        }
-        let middle = 0.5 * (low + high);
-        let falsi = low - f_low * (width / (f_high - f_low));
-        let is_halving = step % 3 == 0 || !(falsi > low && falsi < high);
-        let at = if is_halving { middle } else { falsi };
-        if at <= low || at >= high {
-            break;
-        }
-        let is_found = !is_halving && (at - before).abs() <= FOUND * at.abs();
-        if !is_halving {
-            before = at;
-        }
-        let value = f(at);
-        if value == 0.0 {
+    let (mut is_low_known, mut is_high_known) = (false, false);
+    let mut at = if start > low && start < high { start } else { 0.5 * (low + high) };
+    let (mut last, mut last_newton) = (high - low, 0.0);
+    for _ in 0..STEPS {
+        let Slope { value, rise } = f(at);
+        if value < 0.0 {
+            if at >= to {
+                return to;
+            }
+            (low, is_low_known) = (at, true);
+        } else if value > 0.0 {
+            if at <= from {
+                return from;
+            }
+            (high, is_high_known) = (at, true);
+        } else {
             return at;
         }
-        if value < 0.0 {
-            (low, f_low) = (at, value);
-            if last < 0 {
-                f_high *= 0.5;
+        if high - low <= CLOSED * high.abs().max(low.abs()) {
+            break;
+        }
+        let newton = at - value / rise;
+        let next = if rise > 0.0 && newton > low && newton < high && (newton - at).abs() <= 0.75 * last {
+            // Beside a slope that is steep enough steps are short however far away the root is, and become longer.
+            let step = (newton - at).abs();
+            if step <= FOUND * newton.abs() && step <= SHRINKING * last_newton {
+                return newton;
             }
-            last = -1;
+            last_newton = step;
+            newton
+        } else if value < 0.0 && !is_high_known && !(newton < high) {
+            high
+        } else if value > 0.0 && !is_low_known && !(newton > low) {
+            low
         } else {
-            (high, f_high) = (at, value);
-            if last > 0 {
-                f_low *= 0.5;
-            }
-            last = 1;
+            0.5 * (low + high)
+        };
+        if next == at {
+            break;
         }
-        if is_found {
-            // Beside a slope that is steep enough the same place comes twice however far away the root is.
-            let beyond = at + FOUND.copysign(-value) * at.abs();
-            if beyond <= low || beyond >= high {
-                return at;
-            }
-            let value_beyond = f(beyond);
-            if (value_beyond < 0.0) != (value < 0.0) {
-                return at;
-            }
-            if value_beyond < 0.0 {
-                (low, f_low) = (beyond, value_beyond);
-            } else {
-                (high, f_high) = (beyond, value_beyond);
-            }
-        }
+        last = (next - at).abs();
+        at = next;
     }
-    0.5 * (low + high)
+    at
 }
