@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Process, Site, children, files, is_alive, send, wait_until};
+use common::{Process, TestRun, children, files, is_alive, send, wait_until};
 use rustix::process::Signal;
 use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
 use std::path::{Path, PathBuf};
@@ -17,8 +17,8 @@ static ALONE: Mutex<()> = Mutex::new(());
 const PACED: &[&str] = &["--pace", "realtime"];
 
 /// Starts a run that ends by itself only after a while, and waits until all its parts are there.
-fn start_long(site: &Site, run: &str, more: &[&str]) -> (Process, Vec<(String, u32)>) {
-    let supervisor = site.start_in("cz", run, &[&["corridor-8", "--peer-timeout", "60"], more].concat());
+fn start_long(test_run: &TestRun, run: &str, more: &[&str]) -> (Process, Vec<(String, u32)>) {
+    let supervisor = test_run.start_in("cz", run, &[&["corridor-8", "--peer-timeout", "60"], more].concat());
     let mut parts = Vec::new();
     wait_until("all parts to be there", || {
         // Between fork and exec a child has the command line of its parent.
@@ -42,8 +42,8 @@ fn stop(supervisor: &Process, parts: &[(String, u32)]) {
 }
 
 /// Stops a process while it surely does not hold the lock of the directory of all runs, which `cz clean` takes.
-fn stop_without_lock(site: &Site, id: u32) {
-    let directory = std::fs::File::open(site.runs()).unwrap();
+fn stop_without_lock(test_run: &TestRun, id: u32) {
+    let directory = std::fs::File::open(test_run.runs()).unwrap();
     directory.lock().unwrap();
     send(id, Signal::STOP);
 }
@@ -58,8 +58,8 @@ fn massacre(supervisor: Process, parts: &[(String, u32)]) {
 }
 
 /// Runs `cz clean` and returns what it says.
-fn clean(site: &Site, temporary: &Path, arguments: &[&str]) -> String {
-    let mut command = site.command("cz");
+fn clean(test_run: &TestRun, temporary: &Path, arguments: &[&str]) -> String {
+    let mut command = test_run.command("cz");
     let output = command.env("TMPDIR", temporary).arg("clean").args(arguments).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     String::from_utf8(output.stdout).unwrap()
@@ -86,35 +86,35 @@ impl Drop for Planted {
 #[test]
 fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     let _alone = ALONE.lock();
-    let site = Site::new("clean");
+    let test_run = TestRun::new("clean");
     // What tests before this one left when they failed is not judged here.
-    clean(&site, &std::env::temp_dir(), &[]);
+    clean(&test_run, &std::env::temp_dir(), &[]);
     let alive = common::unique_name("alive");
-    let in_process = site.summary(&["corridor-8", "--in-process"]);
-    let (supervisor, dying) = start_long(&site, site.run(), PACED);
-    let (survivor, parts) = start_long(&site, &alive, &["--json", "-"]);
+    let in_process = test_run.summary(&["corridor-8", "--in-process"]);
+    let (supervisor, dying) = start_long(&test_run, test_run.name(), PACED);
+    let (survivor, parts) = start_long(&test_run, &alive, &["--json", "-"]);
     // It stands still while others are cleared away, so that it is certainly there.
-    let has_services = || files(Some(site.runs().parent().unwrap()), &alive).len() > 10;
+    let has_services = || files(Some(test_run.runs().parent().unwrap()), &alive).len() > 10;
     wait_until("the other run to have services", has_services);
-    stop_without_lock(&site, world(&parts));
-    wait_until("the run to have files", || site.files().len() > 10);
+    stop_without_lock(&test_run, world(&parts));
+    wait_until("the run to have files", || test_run.files().len() > 10);
     massacre(supervisor, &dying);
-    let left = site.files();
+    let left = test_run.files();
     assert!(left.len() > 10, "killed processes leave files: {left:?}");
 
     // What only looks like ours: another runtime directory, another user, no run at all, alive.
     let shm = Path::new("/dev/shm");
     let user = rustix::process::getuid().as_raw();
     let mut others: Vec<PathBuf> = [
-        format!("cz_{user}_{}_00000000_x.data", site.run()),
-        format!("cz_{}_{}_00000000_x.data", user + 1, site.run()),
+        format!("cz_{user}_{}_00000000_x.data", test_run.name()),
+        format!("cz_{}_{}_00000000_x.data", user + 1, test_run.name()),
         format!("cz_bench_{}", std::process::id()),
-        format!("cz_bench_x{}", site.run()),
+        format!("cz_bench_x{}", test_run.name()),
     ]
     .iter()
     .map(|name| shm.join(name))
     .collect();
-    others.push(site.runs().join("not a run"));
+    others.push(test_run.runs().join("not a run"));
     // Taken away again however this test ends: nobody else may.
     let others = Planted::new(others);
     // A process that was, and is no more.
@@ -127,7 +127,7 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     ];
     measurement.iter().for_each(|path| std::fs::write(path, "").unwrap());
 
-    let said = clean(&site, temporary.path(), &["--dry-run"]);
+    let said = clean(&test_run, temporary.path(), &["--dry-run"]);
     let lines = |said: &str, what: &str| -> Vec<PathBuf> {
         let mut paths: Vec<_> =
             said.lines().filter_map(|l| l.strip_prefix(what)).map(PathBuf::from).collect();
@@ -138,9 +138,9 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     expected.sort();
     expected.dedup();
     assert_eq!(lines(&said, "would remove "), expected);
-    assert_eq!(site.files().len(), left.len() + 1, "--dry-run removes nothing");
+    assert_eq!(test_run.files().len(), left.len() + 1, "--dry-run removes nothing");
 
-    let said = clean(&site, temporary.path(), &[]);
+    let said = clean(&test_run, temporary.path(), &[]);
     assert_eq!(lines(&said, "removed "), expected);
     assert!(said.contains(&format!("left {alive}: it is active")), "{said}");
     for path in &expected {
@@ -153,42 +153,43 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
 
     send(world(&parts), Signal::CONT);
     assert_eq!(survivor.ended().hash(), common::hash(&in_process));
-    assert!(clean(&site, temporary.path(), &[]).ends_with("nothing to remove\n"));
-    site.assert_clean();
+    assert!(clean(&test_run, temporary.path(), &[]).ends_with("nothing to remove\n"));
+    test_run.assert_clean();
 }
 
 #[test]
 fn shared_memory_without_its_directory_is_removed() {
     let _alone = ALONE.lock();
-    let site = Site::new("nodir");
-    let (supervisor, parts) = start_long(&site, site.run(), PACED);
-    wait_until("the run to have files", || site.files().len() > 10);
+    let test_run = TestRun::new("nodir");
+    let (supervisor, parts) = start_long(&test_run, test_run.name(), PACED);
+    wait_until("the run to have files", || test_run.files().len() > 10);
     massacre(supervisor, &parts);
-    std::fs::remove_dir_all(site.runs()).unwrap();
-    assert_ne!(site.files(), Vec::<PathBuf>::new());
+    std::fs::remove_dir_all(test_run.runs()).unwrap();
+    assert_ne!(test_run.files(), Vec::<PathBuf>::new());
     let temporary = tempfile::tempdir().unwrap();
     wait_until("clean to remove it", || {
-        clean(&site, temporary.path(), &[]);
-        site.files().is_empty()
+        clean(&test_run, temporary.path(), &[]);
+        test_run.files().is_empty()
     });
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn what_a_run_creates_is_private() {
     let _alone = ALONE.lock();
-    let site = Site::new("modes");
-    let (supervisor, parts) = start_long(&site, site.run(), &[PACED, &["--wait", "block"]].concat());
-    wait_until("the run to have files", || site.files().len() > 30);
+    let test_run = TestRun::new("modes");
+    let (supervisor, parts) = start_long(&test_run, test_run.name(), &[PACED, &["--wait", "block"]].concat());
+    wait_until("the run to have files", || test_run.files().len() > 30);
     stop(&supervisor, &parts);
-    let found = [site.files(), vec![site.runs()]].concat();
+    let found = [test_run.files(), vec![test_run.runs()]].concat();
     assert!(
-        found.iter().any(|p| p.starts_with("/dev/shm")) && found.iter().any(|p| p.starts_with(site.runs()))
+        found.iter().any(|p| p.starts_with("/dev/shm"))
+            && found.iter().any(|p| p.starts_with(test_run.runs()))
     );
     let open: Vec<_> = found
         .iter()
         // iceoryx2 makes its directories 0750, within the run's own, which nobody else can enter.
-        .filter(|path| !path.is_dir() || path.ends_with(site.run()) || path.ends_with("cz"))
+        .filter(|path| !path.is_dir() || path.ends_with(test_run.name()) || path.ends_with("cz"))
         .map(|path| (path.symlink_metadata().unwrap().permissions().mode(), path))
         .filter(|(mode, _)| mode & 0o077 != 0)
         .collect();
@@ -196,47 +197,49 @@ fn what_a_run_creates_is_private() {
     massacre(supervisor, &parts);
     let temporary = tempfile::tempdir().unwrap();
     wait_until("clean to remove it", || {
-        clean(&site, temporary.path(), &[]);
-        site.files().is_empty()
+        clean(&test_run, temporary.path(), &[]);
+        test_run.files().is_empty()
     });
 }
 
 /// `cz` where there is no runtime directory but this temporary one.
-fn cz_in(site: &Site, temporary: &Path, arguments: &[&str]) -> std::process::Output {
-    let mut command = site.command("cz");
+fn cz_in(test_run: &TestRun, temporary: &Path, arguments: &[&str]) -> std::process::Output {
+    let mut command = test_run.command("cz");
     command.env_remove("XDG_RUNTIME_DIR").env("TMPDIR", temporary).args(arguments).output().unwrap()
 }
 
 #[test]
 fn what_is_not_a_run_is_neither_removed_nor_used() {
     let _alone = ALONE.lock();
-    let site = Site::new("photos");
-    let photos = site.runs().join("photos");
+    let test_run = TestRun::new("photos");
+    let photos = test_run.runs().join("photos");
     std::fs::create_dir_all(&photos).unwrap();
-    let kept = [photos.join("summer.jpg"), site.runs().join("empty")];
+    let kept = [photos.join("summer.jpg"), test_run.runs().join("empty")];
     std::fs::write(&kept[0], "picture").unwrap();
     std::fs::create_dir(&kept[1]).unwrap();
     let elsewhere = tempfile::tempdir().unwrap();
-    std::os::unix::fs::symlink(elsewhere.path(), site.runs().join("link")).unwrap();
-    let said = clean(&site, elsewhere.path(), &[]);
+    std::os::unix::fs::symlink(elsewhere.path(), test_run.runs().join("link")).unwrap();
+    let said = clean(&test_run, elsewhere.path(), &[]);
     for name in ["photos", "empty"] {
-        assert!(said.contains(&format!("left {}", site.runs().join(name).display())), "{said}");
-        let output = site.command("cz").args(["run", "--run", name]).output().unwrap();
+        assert!(said.contains(&format!("left {}", test_run.runs().join(name).display())), "{said}");
+        let output = test_run.command("cz").args(["run", "--run", name]).output().unwrap();
         let error = String::from_utf8_lossy(&output.stderr).into_owned();
         assert_eq!(output.status.code(), Some(2), "{error}");
         assert!(error.contains(".cz-run") && error.contains("--run"), "{error}");
     }
-    let output = site.command("cz").args(["run", "--run", "link"]).output().unwrap();
+    let output = test_run.command("cz").args(["run", "--run", "link"]).output().unwrap();
     assert_eq!(output.status.code(), Some(2), "{output:?}");
-    assert!(site.command("cz").args(["run", "--run", site.run()]).output().unwrap().status.success());
+    assert!(
+        test_run.command("cz").args(["run", "--run", test_run.name()]).output().unwrap().status.success()
+    );
     assert!(kept.iter().all(|path| path.exists()), "something of somebody's has been removed");
-    assert!(site.files().is_empty());
+    assert!(test_run.files().is_empty());
 }
 
 #[test]
 fn a_planted_name_in_the_temporary_directory_is_passed_over() {
     let _alone = ALONE.lock();
-    let site = Site::new("planted");
+    let test_run = TestRun::new("planted");
     let (temporary, target) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     let photo = target.path().join("demo").join("summer.jpg");
     std::fs::create_dir(photo.parent().unwrap()).unwrap();
@@ -248,7 +251,7 @@ fn a_planted_name_in_the_temporary_directory_is_passed_over() {
     // As good as another user's: others may write to it.
     std::fs::set_permissions(&next, PermissionsExt::from_mode(0o777)).unwrap();
     for arguments in [&["clean"][..], &["run", "--run", "demo"], &["clean"]] {
-        let output = cz_in(&site, temporary.path(), arguments);
+        let output = cz_in(&test_run, temporary.path(), arguments);
         assert!(output.status.success(), "{arguments:?}: {output:?}");
         assert!(photo.exists(), "{arguments:?} has removed what a link led to");
     }
@@ -259,39 +262,39 @@ fn a_planted_name_in_the_temporary_directory_is_passed_over() {
 #[test]
 fn runs_of_one_name_that_share_nothing_but_shared_memory_do_not_meet() {
     let _alone = ALONE.lock();
-    let site = Site::new("container");
-    let expected = common::hash(&site.summary(&["corridor-8", "--in-process"]));
-    let (first, parts) = start_long(&site, site.run(), &["--json", "-"]);
-    wait_until("the run to have files", || site.files().len() > 30);
+    let test_run = TestRun::new("container");
+    let expected = common::hash(&test_run.summary(&["corridor-8", "--in-process"]));
+    let (first, parts) = start_long(&test_run, test_run.name(), &["--json", "-"]);
+    wait_until("the run to have files", || test_run.files().len() > 30);
     stop(&first, &parts);
     // The same path, and another directory: what a container has that shares /dev/shm alone.
-    let aside = site.runs().with_file_name("aside");
-    std::fs::rename(site.runs(), &aside).unwrap();
-    assert_eq!(common::hash(&site.summary(&["corridor-8"])), expected);
-    assert_eq!(clean(&site, aside.parent().unwrap(), &[]), "nothing to remove\n");
-    std::fs::rename(&aside, site.runs()).unwrap();
+    let aside = test_run.runs().with_file_name("aside");
+    std::fs::rename(test_run.runs(), &aside).unwrap();
+    assert_eq!(common::hash(&test_run.summary(&["corridor-8"])), expected);
+    assert_eq!(clean(&test_run, aside.parent().unwrap(), &[]), "nothing to remove\n");
+    std::fs::rename(&aside, test_run.runs()).unwrap();
     parts.iter().for_each(|(_, id)| send(*id, Signal::CONT));
     first.signal(Signal::CONT);
     assert_eq!(first.ended().hash(), expected);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn files_cut_short_or_written_over_are_cleaned_away_all_the_same() {
     let _alone = ALONE.lock();
     for (how, bytes) in [("empty", 0), ("short", 5), ("random", 70_000)] {
-        let site = Site::new(how);
-        let (supervisor, parts) = start_long(&site, site.run(), PACED);
-        wait_until("the run to have files", || site.files().len() > 30);
+        let test_run = TestRun::new(how);
+        let (supervisor, parts) = start_long(&test_run, test_run.name(), PACED);
+        wait_until("the run to have files", || test_run.files().len() > 30);
         massacre(supervisor, &parts);
         let noise: Vec<u8> =
             (0..bytes as u64).map(|i| (i.wrapping_mul(0x9e37_79b9_7f4a_7c15) >> 56) as u8).collect();
-        let marker = site.runs().join(site.run()).join(".cz-run");
-        for path in site.files().iter().filter(|path| !path.is_dir() && **path != marker) {
+        let marker = test_run.runs().join(test_run.name()).join(".cz-run");
+        for path in test_run.files().iter().filter(|path| !path.is_dir() && **path != marker) {
             std::fs::write(path, &noise).unwrap();
         }
         let temporary = tempfile::tempdir().unwrap();
-        let mut command = site.command("cz");
+        let mut command = test_run.command("cz");
         let mut process = command.env("TMPDIR", temporary.path()).arg("clean").spawn().unwrap();
         let mut status = None;
         common::wait_within(std::time::Duration::from_secs(20), "cz clean to end", || {
@@ -299,37 +302,37 @@ fn files_cut_short_or_written_over_are_cleaned_away_all_the_same() {
             status.is_some()
         });
         assert!(status.unwrap().success(), "{how}: {status:?}");
-        site.assert_clean();
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn what_a_killed_run_left_is_swept_when_the_next_one_begins() {
     let _alone = ALONE.lock();
-    let site = Site::new("sweep");
-    let (supervisor, parts) = start_long(&site, site.run(), PACED);
-    wait_until("the run to have files", || site.files().len() > 10);
+    let test_run = TestRun::new("sweep");
+    let (supervisor, parts) = start_long(&test_run, test_run.name(), PACED);
+    wait_until("the run to have files", || test_run.files().len() > 10);
     massacre(supervisor, &parts);
-    assert_ne!(site.files(), Vec::<PathBuf>::new());
+    assert_ne!(test_run.files(), Vec::<PathBuf>::new());
     let other = common::unique_name("other");
-    let ended = site.start_in("cz", &other, &["--set", "end.time_s=5"]).ended();
+    let ended = test_run.start_in("cz", &other, &["--set", "end.time_s=5"]).ended();
     ended.expect(0, &[]);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_run_waits_for_others_that_come_or_go() {
-    let site = Site::new("queue");
+    let test_run = TestRun::new("queue");
     // As on a machine on which that takes them long.
-    std::fs::DirBuilder::new().mode(0o700).create(site.runs()).unwrap();
+    std::fs::DirBuilder::new().mode(0o700).create(test_run.runs()).unwrap();
     let mut held = std::process::Command::new("flock");
-    let mut held = held.arg(site.runs()).args(["sleep", "7"]).spawn().unwrap();
-    let runs = site.runs();
+    let mut held = held.arg(test_run.runs()).args(["sleep", "7"]).spawn().unwrap();
+    let runs = test_run.runs();
     wait_until("the lock to be taken", || {
         !std::process::Command::new("flock").arg("-n").arg(&runs).arg("true").status().unwrap().success()
     });
-    let run = site.start("cz", &["--set", "end.time_s=10", "--json", "-"]);
+    let run = test_run.start("cz", &["--set", "end.time_s=10", "--json", "-"]);
     held.wait().unwrap();
     run.ended().json();
-    site.assert_clean();
+    test_run.assert_clean();
 }

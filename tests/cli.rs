@@ -5,7 +5,7 @@
 mod common;
 
 use assert_cmd::Command;
-use common::Site;
+use common::TestRun;
 use serde_json::Value;
 
 fn cz(arguments: &[&str]) -> Command {
@@ -33,7 +33,7 @@ fn version() {
     let version = env!("CARGO_PKG_VERSION");
     assert_eq!(stdout(&["--version"]), format!("cz {version}\n"));
     for program in ["cz-world", "cz-coord", "cz-ctrl"] {
-        let output = Site::new("v").command(program).arg("--version").output().unwrap();
+        let output = TestRun::new("v").command(program).arg("--version").output().unwrap();
         let said = String::from_utf8(output.stdout).unwrap();
         assert!(output.status.success() && said.ends_with(&format!(" {version}\n")), "{program}: {said}");
     }
@@ -165,13 +165,13 @@ fn bad_arguments_are_named() {
 #[test]
 fn an_unknown_scenario_is_refused_before_anything_starts() {
     for way in [&["run", "no-such"][..], &["run", "no-such", "--in-process"]] {
-        let site = Site::new("nosuch");
-        let output = site.command("cz").args(way).output().unwrap();
+        let test_run = TestRun::new("nosuch");
+        let output = test_run.command("cz").args(way).output().unwrap();
         let message = String::from_utf8(output.stderr).unwrap();
         assert_eq!(output.status.code(), Some(2), "{message}");
         assert!(message.contains("no-such") && message.contains("two-merges"), "{message}");
         assert_eq!(message.lines().count(), 1, "{message}");
-        site.assert_clean();
+        test_run.assert_clean();
     }
 }
 
@@ -200,29 +200,29 @@ fn json_to_a_file_goes_with_the_table_and_json_to_stdout_alone() {
 
 #[test]
 fn the_seed_and_the_settings_reach_every_process() {
-    let site = Site::new("set");
+    let test_run = TestRun::new("set");
     let arguments = ["tree", "--seed", "9", "--set", "end.time_s=200", "--set=control.replan=from_state"];
-    let in_process = site.summary(&[&arguments[..], &["--in-process"]].concat());
-    let processes = site.summary(&arguments);
+    let in_process = test_run.summary(&[&arguments[..], &["--in-process"]].concat());
+    let processes = test_run.summary(&arguments);
     assert_eq!(in_process["seed"], 9);
     assert_eq!(in_process["steps"], 2000);
     assert_eq!(common::hash(&in_process), common::hash(&processes));
-    let other = site.summary(&["tree", "--seed", "9", "--set", "end.time_s=200", "--in-process"]);
+    let other = test_run.summary(&["tree", "--seed", "9", "--set", "end.time_s=200", "--in-process"]);
     assert_ne!(common::hash(&in_process), common::hash(&other), "from_state drives differently");
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_scenario_file_may_be_anywhere() {
-    let site = Site::new("file");
+    let test_run = TestRun::new("file");
     let directory = tempfile::tempdir().unwrap();
     let text = include_str!("../scenarios/tree.toml").replace("until_s = 600.0", "until_s = 60.0");
     let path = directory.path().join("my tree.toml");
     std::fs::write(&path, text).unwrap();
     let path = path.to_str().unwrap();
-    let (processes, in_process) = (site.summary(&[path]), site.summary(&[path, "--in-process"]));
+    let (processes, in_process) = (test_run.summary(&[path]), test_run.summary(&[path, "--in-process"]));
     assert_eq!(common::hash(&processes), common::hash(&in_process));
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{ENDLESS, Process, Site, children, example, is_alive, send, wait_until};
+use common::{ENDLESS, Process, TestRun, children, example, is_alive, send, wait_until};
 use rustix::process::Signal;
 use std::process::Stdio;
 use std::time::Duration;
@@ -17,9 +17,9 @@ fn arguments(command: &str) -> Vec<String> {
     arguments
 }
 
-fn start(site: &Site, command: &str, more: &[&str]) -> Process {
+fn start(test_run: &TestRun, command: &str, more: &[&str]) -> Process {
     let arguments = arguments(command);
-    site.start("cz", &[&arguments.iter().map(String::as_str).collect::<Vec<_>>(), more].concat())
+    test_run.start("cz", &[&arguments.iter().map(String::as_str).collect::<Vec<_>>(), more].concat())
 }
 
 /// Every process below a supervisor.
@@ -35,9 +35,9 @@ fn results_are_printed_before_whoever_lingers_is_ended() {
         ("helper", format!("sleep 1000 & {cruise}")),
         ("deaf", format!("trap '' TERM; setsid sleep 1000 & {cruise}; sleep 1000")),
     ] {
-        let site = Site::new(tag);
+        let test_run = TestRun::new(tag);
         // Longer than any test: only the signal below ends whoever lingers.
-        let run = start(&site, &command, &["--peer-timeout", "600"]);
+        let run = start(&test_run, &command, &["--peer-timeout", "600"]);
         wait_until("the results", || run.said_so_far().0.contains("state_hash"));
         let left = descendants(run.id());
         assert!(!left.is_empty() && is_alive(run.id()), "{command}: nobody lingers");
@@ -46,35 +46,36 @@ fn results_are_printed_before_whoever_lingers_is_ended() {
         ended.json();
         ended.expect(0, &["controller merge-2 (process ", "was still there when the run was over; it was "]);
         assert!(left.iter().all(|id| !is_alive(*id)), "{command}: {left:?}");
-        site.assert_clean();
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn whoever_lingers_is_ended_by_itself() {
-    let site = Site::new("lingers");
-    let ended = start(&site, &format!("{}; sleep 1000", example("cruise")), &["--peer-timeout", "1"]).ended();
+    let test_run = TestRun::new("lingers");
+    let ended =
+        start(&test_run, &format!("{}; sleep 1000", example("cruise")), &["--peer-timeout", "1"]).ended();
     ended.json();
     ended.expect(0, &["was still there when the run was over; it was ended after 1."]);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_plug_in_that_fails_after_the_run_takes_nothing_with_it() {
-    let site = Site::new("seven");
-    let ended = start(&site, &format!("{}; exit 7", example("cruise")), &[]).ended();
+    let test_run = TestRun::new("seven");
+    let ended = start(&test_run, &format!("{}; exit 7", example("cruise")), &[]).ended();
     ended.json();
     ended.expect(0, &["controller merge-2 (process ", ") ended with code 7; the run was complete"]);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_plug_in_that_leaves_in_the_middle_is_called_that() {
-    let site = Site::new("leaves");
+    let test_run = TestRun::new("leaves");
     let command = format!("{} & sleep 0.3; kill $!; exit 0", example("cruise"));
-    let ended = start(&site, &command, &["--pace", "realtime"]).ended();
+    let ended = start(&test_run, &command, &["--pace", "realtime"]).ended();
     ended.expect(1, &["controller merge-2 (process ", ") left with code 0 in the middle of the run"]);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
@@ -85,8 +86,8 @@ fn whatever_a_plug_in_says_the_run_goes_on() {
         ("long", "head -c 20000000 /dev/zero | tr '\\0' x >&2; head -c 20000000 /dev/zero"),
         ("flood", "(yes flood | head -c 1000000) >&2"),
     ] {
-        let site = Site::new(tag);
-        let ended = start(&site, &format!("{says}; {cruise}"), &[]).ended();
+        let test_run = TestRun::new(tag);
+        let ended = start(&test_run, &format!("{says}; {cruise}"), &[]).ended();
         ended.json();
         assert!(ended.err.lines().all(|line| line.len() < 10_000));
         match tag {
@@ -94,16 +95,16 @@ fn whatever_a_plug_in_says_the_run_goes_on() {
             "long" => ended.expect(0, &["xxx … (19991808 bytes more)"]),
             _ => ended.expect(0, &["] flood"]),
         }
-        site.assert_clean();
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn a_supervisor_whose_stderr_nobody_reads_neither_waits_nor_grows() {
-    let site = Site::new("mute");
+    let test_run = TestRun::new("mute");
     let command = format!("(yes flood | head -c 5000000) >&2; {}", example("cruise"));
-    let mut run = site.command("cz");
-    run.args(["run", "--run", site.run()]).args(arguments(&command));
+    let mut run = test_run.command("cz");
+    run.args(["run", "--run", test_run.name()]).args(arguments(&command));
     let mut run = run.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap();
     let (id, mut peak_kib) = (run.id(), 0);
     let kept_open = run.stderr.take();
@@ -118,32 +119,32 @@ fn a_supervisor_whose_stderr_nobody_reads_neither_waits_nor_grows() {
     assert!(serde_json::from_slice::<serde_json::Value>(&output.stdout).is_ok(), "{output:?}");
     assert!((1..100_000).contains(&peak_kib), "{peak_kib} KiB");
     drop(kept_open);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn stderr_on_a_full_device_is_no_reason_to_panic() {
     let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
-    let site = Site::new("full");
+    let test_run = TestRun::new("full");
     let command = format!("echo something >&2; {}; exit 7", example("cruise"));
-    let mut run = site.command("cz");
-    let recording = site.runs().with_extension("czlog");
-    run.args(["run", "--run", site.run(), "--record"]).arg(&recording).args(arguments(&command));
+    let mut run = test_run.command("cz");
+    let recording = test_run.runs().with_extension("czlog");
+    run.args(["run", "--run", test_run.name(), "--record"]).arg(&recording).args(arguments(&command));
     let output = run.stderr(full()).output().unwrap();
     assert!(output.status.success(), "{output:?}");
     serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap();
     std::fs::remove_file(recording).unwrap();
-    let refused = site.command("cz").args(["run", "--seed", "none"]).stderr(full()).status().unwrap();
+    let refused = test_run.command("cz").args(["run", "--seed", "none"]).stderr(full()).status().unwrap();
     assert_eq!(refused.code(), Some(2));
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_killed_supervisor_takes_plug_ins_with_it_and_what_these_have_started() {
-    let site = Site::new("orphans");
+    let test_run = TestRun::new("orphans");
     let command = format!("sleep 1000 & setsid sleep 1000 & trap '' TERM; {}; sleep 1000", example("cruise"));
     let arguments = ["--controller", &format!("merge-2={command}")];
-    let supervisor = site.start("cz", &[&ENDLESS[..], &arguments].concat());
+    let supervisor = test_run.start("cz", &[&ENDLESS[..], &arguments].concat());
     let mut all = Vec::new();
     wait_until("the plug-in and its helpers", || {
         all = descendants(supervisor.id());
@@ -153,23 +154,23 @@ fn a_killed_supervisor_takes_plug_ins_with_it_and_what_these_have_started() {
     send(supervisor.id(), Signal::KILL);
     wait_until("everybody to have ended", || all.iter().all(|id| !is_alive(*id)));
     assert!(supervisor.ended().was_killed_by(Signal::KILL));
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_closed_terminal_ends_a_run_in_order() {
-    let site = Site::new("hup");
-    let (supervisor, parts) = common::begin(&site, &ENDLESS, 3);
+    let test_run = TestRun::new("hup");
+    let (supervisor, parts) = common::begin(&test_run, &ENDLESS, 3);
     supervisor.signal(Signal::HUP);
     supervisor.ended().expect(130, &["cz: interrupted by SIGHUP"]);
     assert!(parts.iter().all(|(_, id)| !is_alive(*id)));
-    site.assert_clean();
+    test_run.assert_clean();
     // Unless it was to be survived, as under nohup.
-    let mut nohup = site.command("sh");
+    let mut nohup = test_run.command("sh");
     let cz = env!("CARGO_BIN_EXE_cz");
     nohup.args([
         "-c",
-        &format!("trap '' HUP; exec {cz} run --run {} --set end.time_s=1000 --json -", site.run()),
+        &format!("trap '' HUP; exec {cz} run --run {} --set end.time_s=1000 --json -", test_run.name()),
     ]);
     let run = nohup.stdout(Stdio::piped()).spawn().unwrap();
     wait_until("the parts", || children(run.id()).len() == 3);
@@ -180,20 +181,20 @@ fn a_closed_terminal_ends_a_run_in_order() {
     });
     let output = run.wait_with_output().unwrap();
     assert!(output.status.success(), "{output:?}");
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_run_waits_for_those_a_killed_supervisor_of_its_name_has_left() {
-    let site = Site::new("heir");
-    let (supervisor, parts) = common::begin(&site, &ENDLESS, 3);
+    let test_run = TestRun::new("heir");
+    let (supervisor, parts) = common::begin(&test_run, &ENDLESS, 3);
     let world = common::part(&parts, "world");
     // One that is slow to leave, as on a busy machine.
     common::hold(world);
     supervisor.signal(Signal::KILL);
-    let heir = site.start("cz", &["--set", "end.time_s=10", "--json", "-"]);
+    let heir = test_run.start("cz", &["--set", "end.time_s=10", "--json", "-"]);
     std::thread::sleep(Duration::from_secs(2));
     send(world, Signal::CONT);
     heir.ended().json();
-    site.assert_clean();
+    test_run.assert_clean();
 }

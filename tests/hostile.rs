@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Site, files, unique_name, wait_until};
+use common::{TestRun, files, unique_name, wait_until};
 use control_zones::record::Step;
 use control_zones::transport::iox::{BlockInbox, IoxOutbox, RunName, RunSpace};
 use control_zones::transport::{Loan, Outbox, Slots};
@@ -60,7 +60,7 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
         "--set",
         "roads.main1.demand.rates=[{until_s=30000.0,vehicles_per_hour=300.0}]",
     ];
-    let expected = common::hash(&Site::new("u").summary(&[&long[..], &["--in-process"]].concat()));
+    let expected = common::hash(&TestRun::new("u").summary(&[&long[..], &["--in-process"]].concat()));
     // In the runtime directory of this process, which enters the run's space itself.
     let name = unique_name("hostile");
     // So that it ends only when all has been sent: its controller comes late, and leaves the world waiting.
@@ -298,7 +298,7 @@ fn forge<R: Record>(outbox: &mut IoxOutbox<R>, index: u16, step: u64, records: &
 fn well_formed_frames_of_a_process_without_a_place_steer_nobody() {
     // Three coordinators in a row; the tree merges from both sides into the last.
     let scenario = ["tree", "--set", "end.time_s=300"];
-    let expected = common::hash(&Site::new("u").summary(&[&scenario[..], &["--in-process"]].concat()));
+    let expected = common::hash(&TestRun::new("u").summary(&[&scenario[..], &["--in-process"]].concat()));
     let name = unique_name("forge");
     let start = |program: &str, arguments: &[&str]| {
         let mut command = Command::new(program);

@@ -146,12 +146,12 @@ impl Services {
     }
 }
 
-fn tell(desk: &mut MemoryOutbox<Member>, world: &WorldSide) {
+fn tell(outbox: &mut MemoryOutbox<Member>, world: &WorldSide) {
     let members: Vec<Member> = world.members().collect();
     let identity = Identity { run_id: RUN_ID, role: Role::World, index: 0, generation: 0 };
     let header = identity.header(world.world().step(), 0);
     let fill = |slots: &mut Slots<'_, Member>| members.iter().for_each(|m| slots.push(*m));
-    desk.loan(header, members.len(), fill).unwrap().send().unwrap();
+    outbox.loan(header, members.len(), fill).unwrap().send().unwrap();
 }
 
 /// Rounds without progress after which a run is stuck.
@@ -182,14 +182,14 @@ fn run(scenario: &Arc<Scenario>, seed: u64, kills: &Kills, omission: Omission) -
         })
         .collect();
     let mut world = early.unwrap_or_else(|| services.world());
-    let mut desk = services.members.outbox_of(WORLD);
+    let mut outbox = services.members.outbox_of(WORLD);
     let mut generations = vec![0; places];
     for (at, &id) in ids.iter().enumerate() {
         let (role, index) = place(at);
         world.seat(role, index, Seat::new(0, id));
     }
-    tell(&mut desk, &world);
-    let mut world = Some((world, desk));
+    tell(&mut outbox, &world);
+    let mut world = Some((world, outbox));
     let (mut hash, mut killed, mut idle) = (None, 0, 0);
     while there.iter().any(|place| !matches!(place, Place::Left)) || world.is_some() {
         idle += 1;
@@ -224,12 +224,12 @@ fn run(scenario: &Arc<Scenario>, seed: u64, kills: &Kills, omission: Omission) -
             Place::Left => there[at] = Place::Left,
             Place::Killed if hash.is_some() => there[at] = Place::Left,
             Place::Killed => {
-                let Some((driver, desk)) = &mut world else { continue };
+                let Some((driver, outbox)) = &mut world else { continue };
                 let id = id();
                 generations[at] += 1;
                 let newcomer = services.driver(role, index, generations[at], id);
                 driver.seat(role, index, Seat::new(generations[at], id));
-                tell(desk, driver);
+                tell(outbox, driver);
                 there[at] = Place::Waiting(newcomer);
                 idle = 0;
             }

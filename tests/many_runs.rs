@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Ended, Process, Site, children, files, unique_name, wait_until};
+use common::{Ended, Process, TestRun, children, files, unique_name, wait_until};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::process::{Pid, Signal, kill_process};
@@ -55,11 +55,11 @@ fn kill(supervisor: &Process, victim: &str) {
     }
 }
 
-fn live(site: &Site, fate: &Fate) -> Ended {
+fn live(test_run: &TestRun, fate: &Fate) -> Ended {
     let seed = fate.seed.to_string();
     let arguments =
         ["paper", "--seed", &seed, "--json", "-", "--peer-timeout", "60", "--attach-timeout", "60"];
-    let supervisor = site.start_in("cz", &fate.run, &arguments);
+    let supervisor = test_run.start_in("cz", &fate.run, &arguments);
     if let Some((victim, delay)) = fate.victim {
         std::thread::sleep(delay);
         kill(&supervisor, victim);
@@ -68,7 +68,7 @@ fn live(site: &Site, fate: &Fate) -> Ended {
 }
 
 fn many_runs(count: u32, at_a_time: usize, seed: u64) {
-    let site = Site::new("many");
+    let test_run = TestRun::new("many");
     let fates = fates(count, seed);
     let queue = Mutex::new(fates.iter());
     let next = || queue.lock().unwrap().next();
@@ -77,7 +77,7 @@ fn many_runs(count: u32, at_a_time: usize, seed: u64) {
         for _ in 0..at_a_time {
             scope.spawn(|| {
                 while let Some(fate) = next() {
-                    let ended = live(&site, fate);
+                    let ended = live(&test_run, fate);
                     ends.lock().unwrap().push((fate, ended));
                 }
             });
@@ -94,17 +94,17 @@ fn many_runs(count: u32, at_a_time: usize, seed: u64) {
     assert!(killed >= 1, "nobody was killed");
 
     let left = || -> Vec<PathBuf> {
-        fates.iter().flat_map(|fate| files(Some(site.runs().parent().unwrap()), &fate.run)).collect()
+        fates.iter().flat_map(|fate| files(Some(test_run.runs().parent().unwrap()), &fate.run)).collect()
     };
     let mut said = String::new();
     wait_until("cz clean to have removed what the killed have left", || {
-        let output = site.command("cz").arg("clean").output().unwrap();
+        let output = test_run.command("cz").arg("clean").output().unwrap();
         assert!(output.status.success());
         said.push_str(&String::from_utf8_lossy(&output.stdout));
         left().is_empty()
     });
     assert!(!said.contains("could not"), "{said}");
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]

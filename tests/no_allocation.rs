@@ -124,11 +124,11 @@ fn steady_steps_over_shared_memory_allocate_nothing() {
     let mut world = WorldDriver::new(World::new(scenario.clone(), 1), ports, 7, 1);
     world.seat(Role::Coordinator, 0, Seat::new(0, own));
     world.seat(Role::Controller, 0, Seat::new(0, own));
-    let mut desk = members.outbox(2).unwrap();
+    let mut outbox = members.outbox(2).unwrap();
     let told: Vec<Member> = world.members().collect();
     let header = Identity { index: 0, ..identity(Role::World) }.header(0, 0);
     let fill = |slots: &mut Slots<'_, Member>| told.iter().for_each(|m| slots.push(*m));
-    desk.loan(header, told.len(), fill).unwrap().send().unwrap();
+    outbox.loan(header, told.len(), fill).unwrap().send().unwrap();
     let (mut judge, mut finished) = (Judge::new(LOANS_PER_STEP), false);
     while !finished {
         let step = world.world().step();

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::Site;
+use common::TestRun;
 use control_zones::scenario::{Scenario, load_given};
 use control_zones::world::{OverlapSummary, World};
 use ipc_schemas::{NO_ZONE, STATE_LEFT, VehicleCommand, VehicleState};
@@ -19,7 +19,7 @@ const DT_S: f64 = 0.1;
 /// count of samples made elsewhere.
 #[test]
 fn a_vehicle_that_passes_another_is_in_table_json_and_stderr() {
-    let site = Site::new("overlap");
+    let test_run = TestRun::new("overlap");
     let arguments = [
         "run",
         "paper",
@@ -33,19 +33,19 @@ fn a_vehicle_that_passes_another_is_in_table_json_and_stderr() {
         "--set",
         "zones.merge-2.flow={policy=\"none\"}",
     ];
-    let output = site.command("cz").args(arguments).output().unwrap();
+    let output = test_run.command("cz").args(arguments).output().unwrap();
     let (stdout, stderr) =
         (String::from_utf8(output.stdout).unwrap(), String::from_utf8(output.stderr).unwrap());
     let said = "bodies overlapped: 1 pair of vehicles, 4.67 s in all (47 samples), by up to 4.50 m; first 72 \
                 and 73 in merge-2 at 232.7 s";
     assert!(stdout.contains(said), "{stdout}");
     assert!(stderr.contains(&format!("cz: warning: {said}")), "{stderr}");
-    let json = site.summary(&[&arguments[1..2], &arguments[3..]].concat());
+    let json = test_run.summary(&[&arguments[1..2], &arguments[3..]].concat());
     let overlaps = &json["overlaps"];
     assert_eq!((&overlaps["pairs"], &overlaps["samples"]), (&1.into(), &47.into()));
     assert_eq!(overlaps["first"]["vehicles"], serde_json::json!([72, 73]));
     // Nothing overlaps in what the program does when nothing else is asked of it.
-    let quiet = site.command("cz").args(["run", "--in-process"]).output().unwrap();
+    let quiet = test_run.command("cz").args(["run", "--in-process"]).output().unwrap();
     assert!(!String::from_utf8(quiet.stderr).unwrap().contains("overlapped"));
 }
 

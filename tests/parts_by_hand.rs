@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Ended, Site, files, unique_name, wait_until};
+use common::{Ended, TestRun, files, unique_name, wait_until};
 use control_zones::scenario::{decode, load_embedded, scenario_hash};
 use control_zones::transport::iox::{AttachLine, RunName, RunSpace, SpaceError};
 use ipc_schemas::{
@@ -20,14 +20,14 @@ const CONTROLLER: (&str, &[&str]) = ("cz-ctrl", &[]);
 
 /// The state hash of the default scenario, as `cz run` gives it.
 fn expected() -> String {
-    common::hash(&Site::new("e").summary(&["--in-process"]))
+    common::hash(&TestRun::new("e").summary(&["--in-process"]))
 }
 
 /// Starts the parts in that order, with pauses, and returns how they ended.
-fn start(site: &Site, run: &str, parts: &[(&str, &[&str])]) -> Vec<Ended> {
+fn start(test_run: &TestRun, run: &str, parts: &[(&str, &[&str])]) -> Vec<Ended> {
     let mut started = Vec::new();
     for (program, arguments) in parts {
-        started.push(site.start_in(program, run, arguments));
+        started.push(test_run.start_in(program, run, arguments));
         // Long enough for the part to be waiting for the others; the result must not depend on it.
         std::thread::sleep(Duration::from_millis(80));
     }
@@ -53,102 +53,104 @@ fn every_order_gives_the_same_hash() {
         [CONTROLLER, WORLD, COORDINATOR],
         [CONTROLLER, COORDINATOR, WORLD],
     ] {
-        let site = Site::new("order");
-        let ended = start(&site, site.run(), &order);
+        let test_run = TestRun::new("order");
+        let ended = start(&test_run, test_run.name(), &order);
         assert_eq!(hash(&ended), expected, "{:?}", order.map(|(program, _)| program));
-        site.assert_clean();
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn a_name_can_be_used_again() {
-    let (site, expected) = (Site::new("again"), expected());
+    let (test_run, expected) = (TestRun::new("again"), expected());
     for _ in 0..3 {
-        assert_eq!(hash(&start(&site, site.run(), &[COORDINATOR, WORLD, CONTROLLER])), expected);
-        site.assert_clean();
+        assert_eq!(hash(&start(&test_run, test_run.name(), &[COORDINATOR, WORLD, CONTROLLER])), expected);
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn runs_of_different_names_do_not_see_each_other() {
-    let site = Site::new("a");
+    let test_run = TestRun::new("a");
     // One name begins with the other: a prefix of file names must not match both.
-    let second = format!("{}-b", site.run());
+    let second = format!("{}-b", test_run.name());
     let parts = |run| {
-        [COORDINATOR, CONTROLLER, WORLD].map(|(program, arguments)| site.start_in(program, run, arguments))
+        [COORDINATOR, CONTROLLER, WORLD]
+            .map(|(program, arguments)| test_run.start_in(program, run, arguments))
     };
-    let (one, other) = (parts(site.run()), parts(&second));
+    let (one, other) = (parts(test_run.name()), parts(&second));
     let expected = expected();
     for run in [one, other] {
         assert_eq!(hash(&run.map(|part| part.ended())), expected);
     }
     assert_eq!(files(None, &second), Vec::<std::path::PathBuf>::new());
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_second_world_of_an_active_run_is_refused() {
-    let site = Site::new("twice");
-    let world = site.start("cz-world", WORLD.1);
-    site.wait_until_settled();
-    site.start("cz-world", &[]).ended().expect(2, &["cz-world: ", site.run(), "active", "--run"]);
+    let test_run = TestRun::new("twice");
+    let world = test_run.start("cz-world", WORLD.1);
+    test_run.wait_until_settled();
+    test_run.start("cz-world", &[]).ended().expect(2, &["cz-world: ", test_run.name(), "active", "--run"]);
     // And so is a whole run: its participants would take the places of this one's.
-    site.start("cz", &[]).ended().expect(2, &["cz: ", site.run(), "active", "--run"]);
+    test_run.start("cz", &[]).ended().expect(2, &["cz: ", test_run.name(), "active", "--run"]);
     // The first one is none the worse for it.
-    let mut parts = start(&site, site.run(), &[COORDINATOR, CONTROLLER]);
+    let mut parts = start(&test_run, test_run.name(), &[COORDINATOR, CONTROLLER]);
     parts.push(world.ended());
     assert_eq!(hash(&parts), expected());
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_participant_without_a_world_says_so() {
-    let site = Site::new("noworld");
+    let test_run = TestRun::new("noworld");
     for program in ["cz-ctrl", "cz-coord"] {
-        let ended = site.start(program, &["--attach-timeout", "1"]).ended();
-        ended.expect(1, &[&format!("{program}: "), "1 s", &format!("cz-world --run {}", site.run())]);
-        site.assert_clean();
+        let ended = test_run.start(program, &["--attach-timeout", "1"]).ended();
+        ended.expect(1, &[&format!("{program}: "), "1 s", &format!("cz-world --run {}", test_run.name())]);
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn a_world_without_participants_says_whom_it_misses() {
-    let site = Site::new("nobody");
-    let world = site.start("cz-world", &["--attach-timeout", "1"]);
-    world.ended().expect(1, &["1 s", "coordinator 0", &format!("cz-coord --run {}", site.run())]);
-    site.assert_clean();
+    let test_run = TestRun::new("nobody");
+    let world = test_run.start("cz-world", &["--attach-timeout", "1"]);
+    world.ended().expect(1, &["1 s", "coordinator 0", &format!("cz-coord --run {}", test_run.name())]);
+    test_run.assert_clean();
 
-    let coordinator = site.start("cz-coord", &[]);
-    let world = site.start("cz-world", &["--attach-timeout", "1"]);
-    world.ended().expect(1, &["1 s", "controller 0", &format!("cz-ctrl --run {}", site.run())]);
+    let coordinator = test_run.start("cz-coord", &[]);
+    let world = test_run.start("cz-world", &["--attach-timeout", "1"]);
+    world.ended().expect(1, &["1 s", "controller 0", &format!("cz-ctrl --run {}", test_run.name())]);
     // The coordinator had been let in and lost its world.
     coordinator.ended().expect(1, &["the world"]);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_participant_with_another_scenario_is_refused_with_both_hashes() {
-    let site = Site::new("scenario");
-    let world = site.start("cz-world", WORLD.1);
+    let test_run = TestRun::new("scenario");
+    let world = test_run.start("cz-world", WORLD.1);
     let hash_of = |name, seed| format!("{:016x}", scenario_hash(&load_embedded(name, &[], seed).unwrap()));
     let ours = hash_of("two-merges", None);
-    site.start("cz-ctrl", &["tree"]).ended().expect(1, &["refused", &hash_of("tree", None), &ours]);
+    test_run.start("cz-ctrl", &["tree"]).ended().expect(1, &["refused", &hash_of("tree", None), &ours]);
     let seed_2 = hash_of("two-merges", Some(2));
-    site.start("cz-coord", &["--seed", "2"]).ended().expect(1, &["refused", &seed_2, &ours]);
+    test_run.start("cz-coord", &["--seed", "2"]).ended().expect(1, &["refused", &seed_2, &ours]);
     // The same scenario said again is welcome.
-    let mut parts = start(&site, site.run(), &[("cz-coord", &["two-merges"]), ("cz-ctrl", &["--seed", "1"])]);
+    let mut parts =
+        start(&test_run, test_run.name(), &[("cz-coord", &["two-merges"]), ("cz-ctrl", &["--seed", "1"])]);
     parts.push(world.ended());
     assert_eq!(hash(&parts), expected());
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn an_index_that_is_taken_or_beyond_is_refused() {
-    let site = Site::new("index");
-    let world = site.start("cz-world", &["--json", "-", "--ctrl-procs", "2"]);
-    site.start("cz-ctrl", &["--index", "2"]).ended().expect(1, &["refused", "index 2", "beyond"]);
+    let test_run = TestRun::new("index");
+    let world = test_run.start("cz-world", &["--json", "-", "--ctrl-procs", "2"]);
+    test_run.start("cz-ctrl", &["--index", "2"]).ended().expect(1, &["refused", "index 2", "beyond"]);
     // Of two that want the same place one gets it, whichever comes first.
-    let mut rivals = ["0", "0"].map(|index| Some(site.start("cz-ctrl", &["--index", index])));
+    let mut rivals = ["0", "0"].map(|index| Some(test_run.start("cz-ctrl", &["--index", index])));
     let mut refused = None;
     wait_until("one of two rivals to be refused", || {
         refused = rivals.iter().position(|r| r.as_ref().is_some_and(|r| !common::is_alive(r.id())));
@@ -156,18 +158,18 @@ fn an_index_that_is_taken_or_beyond_is_refused() {
     });
     let loser = rivals[refused.expect("the wait ended with one")].take().expect("it is taken once");
     loser.ended().expect(1, &["refused", "index 0", "taken"]);
-    let mut parts = start(&site, site.run(), &[("cz-ctrl", &["--index", "1"]), COORDINATOR]);
+    let mut parts = start(&test_run, test_run.name(), &[("cz-ctrl", &["--index", "1"]), COORDINATOR]);
     parts.push(world.ended());
     parts.extend(rivals.into_iter().flatten().map(|rival| rival.ended()));
     assert_eq!(hash(&parts), expected());
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn when_all_places_are_taken_the_next_is_refused() {
-    let site = Site::new("full");
-    let world = site.start("cz-world", &[]);
-    let mut pair = [0, 1].map(|_| Some(site.start("cz-ctrl", &[])));
+    let test_run = TestRun::new("full");
+    let world = test_run.start("cz-world", &[]);
+    let mut pair = [0, 1].map(|_| Some(test_run.start("cz-ctrl", &[])));
     let mut refused = None;
     wait_until("one of two controllers to be refused", || {
         refused = pair.iter().position(|r| r.as_ref().is_some_and(|r| !common::is_alive(r.id())));
@@ -181,7 +183,7 @@ fn when_all_places_are_taken_the_next_is_refused() {
     first.ended().expect(130, &["interrupted"]);
     world.signal(Signal::INT);
     world.ended().expect(130, &["interrupted"]);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 /// What the world answers to a request nobody of this build would send.
@@ -204,8 +206,8 @@ fn answer(line: &AttachLine, request: AttachRequest) -> AttachReply {
 #[test]
 fn a_participant_of_another_build_is_refused_with_both_hashes() {
     // This process takes part itself, so the run is in its own runtime directory.
-    let (site, name) = (Site::new("unused"), unique_name("schema"));
-    let mut command = site.command("cz-world");
+    let (test_run, name) = (TestRun::new("unused"), unique_name("schema"));
+    let mut command = test_run.command("cz-world");
     match std::env::var_os("XDG_RUNTIME_DIR") {
         Some(runtime) => command.env("XDG_RUNTIME_DIR", runtime),
         None => command.env_remove("XDG_RUNTIME_DIR"),
@@ -254,40 +256,40 @@ fn a_participant_of_another_build_is_refused_with_both_hashes() {
 
 #[test]
 fn a_killed_world_can_be_started_again_while_somebody_waits_to_join() {
-    let site = Site::new("second");
+    let test_run = TestRun::new("second");
     // One joins, and waits for the coordinator; the other finds no place and goes; then the world is killed.
-    let world = site.start("cz-world", &["--ctrl-procs", "2", "--json", "-"]);
-    site.wait_until_settled();
+    let world = test_run.start("cz-world", &["--ctrl-procs", "2", "--json", "-"]);
+    test_run.wait_until_settled();
     // It cannot be answered while the world is stopped, so it waits to join when the world dies.
     world.signal(Signal::STOP);
-    let waiting = site.start("cz-ctrl", &[]);
+    let waiting = test_run.start("cz-ctrl", &[]);
     std::thread::sleep(Duration::from_millis(500));
     world.signal(Signal::KILL);
     assert!(world.ended().was_killed_by(Signal::KILL));
-    let mut parts = start(&site, site.run(), &[("cz-world", &["--json", "-"]), COORDINATOR]);
+    let mut parts = start(&test_run, test_run.name(), &[("cz-world", &["--json", "-"]), COORDINATOR]);
     parts.push(waiting.ended());
     assert_eq!(hash(&parts), expected());
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn the_last_part_may_come_as_late_as_the_world_waits_for_it() {
-    let site = Site::new("last");
+    let test_run = TestRun::new("last");
     // A part that is ready waits for the others longer than for a frame.
-    let world = site.start("cz-world", &["--json", "-", "--peer-timeout", "1"]);
-    let controller = site.start("cz-ctrl", &["--peer-timeout", "1"]);
+    let world = test_run.start("cz-world", &["--json", "-", "--peer-timeout", "1"]);
+    let controller = test_run.start("cz-ctrl", &["--peer-timeout", "1"]);
     std::thread::sleep(Duration::from_secs(3));
-    let mut parts = start(&site, site.run(), &[COORDINATOR]);
+    let mut parts = start(&test_run, test_run.name(), &[COORDINATOR]);
     parts.extend([world.ended(), controller.ended()]);
     assert_eq!(hash(&parts), expected());
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_name_that_looks_like_an_option_is_refused() {
-    let site = Site::new("dash");
+    let test_run = TestRun::new("dash");
     for program in ["cz", "cz-world", "cz-ctrl"] {
-        let mut command = site.command(program);
+        let mut command = test_run.command(program);
         if program == "cz" {
             command.arg("run");
         }
@@ -296,5 +298,5 @@ fn a_name_that_looks_like_an_option_is_refused() {
         assert_eq!(output.status.code(), Some(2), "{said}");
         assert!(said.contains("not beginning with '-'"), "{said}");
     }
-    site.assert_clean();
+    test_run.assert_clean();
 }

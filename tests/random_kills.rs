@@ -5,7 +5,7 @@
 
 mod common;
 
-use common::{Ended, LONG_RUN, Process, Site, children, is_alive};
+use common::{Ended, LONG_RUN, Process, TestRun, children, is_alive};
 use rand::seq::IndexedRandom;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -89,7 +89,7 @@ fn kill(supervisor: &Process, victim: &'static str, which: usize) -> bool {
     is_alive(id) && Pid::from_raw(id as i32).is_some_and(|id| kill_process(id, Signal::KILL).is_ok())
 }
 
-fn live(site: &Site, disturbance: &Disturbance, recording: &str) -> Course {
+fn live(test_run: &TestRun, disturbance: &Disturbance, recording: &str) -> Course {
     let (scenario, settings, _) = SCENARIOS[disturbance.scenario];
     let mut arguments = vec![scenario, "--json", "-"];
     arguments.extend(settings);
@@ -97,7 +97,7 @@ fn live(site: &Site, disturbance: &Disturbance, recording: &str) -> Course {
     if disturbance.is_recorded {
         arguments.extend(["--record", recording]);
     }
-    let supervisor = site.start("cz", &arguments);
+    let supervisor = test_run.start("cz", &arguments);
     let mut killed = Vec::new();
     for (victim, which, pause) in &disturbance.kills {
         std::thread::sleep(*pause);
@@ -111,10 +111,10 @@ fn live(site: &Site, disturbance: &Disturbance, recording: &str) -> Course {
 /// What was wrong with a run, if anything was.
 fn check(seed: u64, length: &[Duration], expected: &HashMap<usize, String>) -> Result<&'static str, String> {
     let disturbance = Disturbance::draw(seed, length);
-    let site = Site::new("rk");
+    let test_run = TestRun::new("rk");
     let recordings = tempfile::tempdir().unwrap();
     let recording = recordings.path().join("r.czlog").display().to_string();
-    let Course { killed, ended } = live(&site, &disturbance, &recording);
+    let Course { killed, ended } = live(&test_run, &disturbance, &recording);
     let scene = || format!("seed {seed}: {disturbance:?}, killed {killed:?}: {ended:?}");
     let expected = &expected[&disturbance.scenario];
     let was_fatal = killed.iter().any(|victim| ["world", "cz"].contains(victim));
@@ -129,14 +129,14 @@ fn check(seed: u64, length: &[Duration], expected: &HashMap<usize, String>) -> R
         // The children of a killed supervisor are on their way out; the next of its name waits for them.
         let began = std::fs::metadata(&recording).is_ok_and(|file| file.len() > 0);
         let again = if began {
-            let mut command = site.command("cz");
-            command.args(["resume", &recording, "--run", site.run(), "--json", "-"]);
+            let mut command = test_run.command("cz");
+            command.args(["resume", &recording, "--run", test_run.name(), "--json", "-"]);
             command.output().unwrap()
         } else {
             // Nothing to be resumed, for it was not recorded or had not begun: from the beginning.
             let (scenario, settings, _) = SCENARIOS[disturbance.scenario];
-            let mut command = site.command("cz");
-            command.args(["run", scenario, "--run", site.run(), "--json", "-"]).args(settings);
+            let mut command = test_run.command("cz");
+            command.args(["run", scenario, "--run", test_run.name(), "--json", "-"]).args(settings);
             command.output().unwrap()
         };
         let said = String::from_utf8_lossy(&again.stderr).into_owned();
@@ -154,11 +154,11 @@ fn check(seed: u64, length: &[Duration], expected: &HashMap<usize, String>) -> R
         }
     };
     let patience = Instant::now() + Duration::from_secs(20);
-    while !site.files().is_empty() && Instant::now() < patience {
+    while !test_run.files().is_empty() && Instant::now() < patience {
         std::thread::sleep(Duration::from_millis(20));
     }
-    if !site.files().is_empty() {
-        return Err(format!("left behind {:?}: {}", site.files(), scene()));
+    if !test_run.files().is_empty() {
+        return Err(format!("left behind {:?}: {}", test_run.files(), scene()));
     }
     Ok(verdict)
 }
@@ -169,11 +169,11 @@ fn random_kills(seeds: std::ops::Range<u64>) {
     for (i, (scenario, settings, _)) in SCENARIOS.iter().enumerate() {
         expected.insert(
             i,
-            common::hash(&Site::new("u").summary(&[&[*scenario, "--in-process"], *settings].concat())),
+            common::hash(&TestRun::new("u").summary(&[&[*scenario, "--in-process"], *settings].concat())),
         );
         let start = Instant::now();
-        let site = Site::new("u");
-        let run = site.start("cz", &[&[*scenario, "--wait", "block"], *settings].concat());
+        let test_run = TestRun::new("u");
+        let run = test_run.start("cz", &[&[*scenario, "--wait", "block"], *settings].concat());
         run.ended_within(VERY_LONG).expect(0, &[]);
         length.push(start.elapsed());
     }

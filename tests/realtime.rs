@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Site, hash};
+use common::{TestRun, hash};
 use rustix::process::{Resource, Rlimit, geteuid, setrlimit};
 use serde_json::Value;
 use std::os::unix::fs::{PermissionsExt, chown};
@@ -22,8 +22,8 @@ const PROCESSES: [&str; 3] = ["world", "coordinator 0", "controller 0"];
 
 #[test]
 fn states_are_the_same_and_every_process_says_what_it_got() {
-    let site = Site::new("rt");
-    let in_process = site.summary(&["two-merges", "--in-process"]);
+    let test_run = TestRun::new("rt");
+    let in_process = test_run.summary(&["two-merges", "--in-process"]);
     for (way, asked) in [
         (&["--rt"][..], true),
         (&["--rt", "--pin", "auto"], true),
@@ -31,7 +31,7 @@ fn states_are_the_same_and_every_process_says_what_it_got() {
         (&["--pin", "auto"], false),
         (&["--pin", "none"], false),
     ] {
-        let summary = site.summary(&[&["two-merges"], way].concat());
+        let summary = test_run.summary(&[&["two-merges"], way].concat());
         assert_eq!(hash(&summary), hash(&in_process), "{way:?}");
         for process in PROCESSES {
             let got = placement(&summary, process);
@@ -52,7 +52,7 @@ fn states_are_the_same_and_every_process_says_what_it_got() {
         }
     }
     assert_eq!(in_process["placement"], Value::Array(vec![]));
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 /// `cz run --rt` without any right to what it asks for.
@@ -88,17 +88,17 @@ fn a_refusal_is_said_and_ends_nothing() {
         assert_eq!(got["memory_locked"], false, "{got}");
         assert_eq!(got["memory_note"], "ENOMEM; limit 64 KiB", "{got}");
     }
-    assert_eq!(hash(&summary), hash(&Site::new("e").summary(&["two-merges", "--in-process"])));
+    assert_eq!(hash(&summary), hash(&TestRun::new("e").summary(&["two-merges", "--in-process"])));
 }
 
 #[test]
 fn the_parts_of_a_run_by_hand_say_it_themselves() {
-    let site = Site::new("rthand");
-    let world = site.start("cz-world", &["two-merges", "--rt"]);
+    let test_run = TestRun::new("rthand");
+    let world = test_run.start("cz-world", &["two-merges", "--rt"]);
     let parts = [("coordinator 0", "cz-coord"), ("controller 0", "cz-ctrl")]
-        .map(|(name, program)| (name, site.start(program, &["--rt"])));
+        .map(|(name, program)| (name, test_run.start(program, &["--rt"])));
     for (name, part) in [("world", world)].into_iter().chain(parts) {
         part.ended().expect(0, &[&format!("{name}: core "), "SCHED_", "memory "]);
     }
-    site.assert_clean();
+    test_run.assert_clean();
 }

@@ -4,20 +4,20 @@
 
 mod common;
 
-use common::{Ended, LONG_RUN, Process, Site, children, part, send, ticks, wait_until};
+use common::{Ended, LONG_RUN, Process, TestRun, children, part, send, ticks, wait_until};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::process::Signal;
 use std::time::Duration;
 
 fn undisturbed() -> String {
-    common::hash(&Site::new("u").summary(&[&LONG_RUN[..], &["--in-process"]].concat()))
+    common::hash(&TestRun::new("u").summary(&[&LONG_RUN[..], &["--in-process"]].concat()))
 }
 
 /// A supervised run that steps.
-fn begin(site: &Site, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
+fn begin(test_run: &TestRun, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
     let json = ["--json", "-"];
-    let (supervisor, parts) = common::begin(site, &[&LONG_RUN[..], &json, arguments].concat(), processes);
+    let (supervisor, parts) = common::begin(test_run, &[&LONG_RUN[..], &json, arguments].concat(), processes);
     let world = part(&parts, "world");
     wait_until("the world to be stepping", || ticks(world) >= 5);
     (supervisor, parts)
@@ -25,13 +25,13 @@ fn begin(site: &Site, arguments: &[&str], processes: usize) -> (Process, Vec<(St
 
 /// Kills the first process of each kind named after a while, and returns how the run ended.
 fn disturb(
-    site: &Site,
+    test_run: &TestRun,
     arguments: &[&str],
     processes: usize,
     victims: &[&str],
     after: Duration,
 ) -> (Ended, usize) {
-    let (supervisor, parts) = begin(site, arguments, processes);
+    let (supervisor, parts) = begin(test_run, arguments, processes);
     std::thread::sleep(after);
     let mut killed = 0;
     for victim in victims {
@@ -58,9 +58,9 @@ fn matrix(times: usize, shares: &[&str], processes: usize) {
     for victims in [&["ctrl"][..], &["coord"], &["ctrl", "coord"]] {
         let (mut replaced, mut step_ms) = (0, Vec::new());
         for _ in 0..times {
-            let site = Site::new("kill");
+            let test_run = TestRun::new("kill");
             let after = Duration::from_millis(rng.random_range(0..150));
-            let (ended, killed) = disturb(&site, shares, processes, victims, after);
+            let (ended, killed) = disturb(&test_run, shares, processes, victims, after);
             let summary = ended.json();
             assert_eq!(common::hash(&summary), expected, "{ended:?}");
             let replacements = summary["replacements"].as_array().unwrap();
@@ -68,7 +68,7 @@ fn matrix(times: usize, shares: &[&str], processes: usize) {
             assert!(replacements.iter().all(|r| r["generation"] == 1), "{ended:?}");
             replaced += replacements.len();
             step_ms.extend(replacements.iter().map(|r| r["step_ms"].as_f64().unwrap()));
-            site.assert_clean();
+            test_run.assert_clean();
         }
         // Some may have been killed at the very end.
         assert!(replaced * 2 > times * victims.len(), "only {replaced} replacements of {victims:?}");
@@ -108,8 +108,8 @@ fn a_part_killed_again_and_again_is_replaced_each_time() {
         "roads.main1.demand.rates=[{until_s=60000.0,vehicles_per_hour=300.0}]",
     ];
     let whole = [&LONG_RUN[..], &longer, &["--in-process"]].concat();
-    let (site, expected) = (Site::new("again"), common::hash(&Site::new("u").summary(&whole)));
-    let (supervisor, _) = begin(&site, &longer, 3);
+    let (test_run, expected) = (TestRun::new("again"), common::hash(&TestRun::new("u").summary(&whole)));
+    let (supervisor, _) = begin(&test_run, &longer, 3);
     let mut killed = Vec::new();
     wait_until("five controllers to have been killed", || {
         let parts = children(supervisor.id());
@@ -125,50 +125,50 @@ fn a_part_killed_again_and_again_is_replaced_each_time() {
     let summary = supervisor.ended().json();
     assert_eq!(common::hash(&summary), expected);
     assert_eq!(summary["replacements"].as_array().unwrap().len(), 5);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn parts_started_by_hand_leave_and_rejoin() {
     let expected = undisturbed();
-    let site = Site::new("rejoin");
-    let world = site.start("cz-world", &[&LONG_RUN[..], &["--json", "-"]].concat());
-    let coordinator = site.start("cz-coord", &[]);
-    let controller = site.start("cz-ctrl", &[]);
+    let test_run = TestRun::new("rejoin");
+    let world = test_run.start("cz-world", &[&LONG_RUN[..], &["--json", "-"]].concat());
+    let coordinator = test_run.start("cz-coord", &[]);
+    let controller = test_run.start("cz-ctrl", &[]);
     wait_until("the world to be stepping", || ticks(world.id()) >= 5);
     controller.signal(Signal::INT);
     controller.ended().expect(130, &["interrupted at step"]);
     coordinator.signal(Signal::KILL);
-    let successors = [site.start("cz-coord", &[]), site.start("cz-ctrl", &[])];
+    let successors = [test_run.start("cz-coord", &[]), test_run.start("cz-ctrl", &[])];
     let summary = world.ended().json();
     assert_eq!(common::hash(&summary), expected);
     assert_eq!(summary["replacements"].as_array().unwrap().len(), 2);
     successors.into_iter().for_each(|part| part.ended().expect(0, &[]));
     assert!(coordinator.ended().was_killed_by(Signal::KILL));
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn nobody_joins_a_run_in_which_nobody_is_missing() {
-    let site = Site::new("late");
-    let (supervisor, _) = begin(&site, &[], 3);
-    let late = site.start("cz-ctrl", &[]).ended();
+    let test_run = TestRun::new("late");
+    let (supervisor, _) = begin(&test_run, &[], 3);
+    let late = test_run.start("cz-ctrl", &[]).ended();
     late.expect(1, &["refused", "under way", "nobody is missing"]);
     assert_eq!(supervisor.ended().hash(), undisturbed());
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_world_nobody_comes_back_to_gives_up_and_says_for_whom_it_waited() {
-    let site = Site::new("lost");
-    let world = site.start("cz-world", &[&LONG_RUN[..], &["--peer-timeout", "1"]].concat());
-    let coordinator = site.start("cz-coord", &[]);
-    let controller = site.start("cz-ctrl", &[]);
+    let test_run = TestRun::new("lost");
+    let world = test_run.start("cz-world", &[&LONG_RUN[..], &["--peer-timeout", "1"]].concat());
+    let coordinator = test_run.start("cz-coord", &[]);
+    let controller = test_run.start("cz-ctrl", &[]);
     wait_until("the world to be stepping", || ticks(world.id()) >= 5);
     let dead = format!("controller 0 (process {}) is gone", controller.id());
     controller.signal(Signal::KILL);
     world.ended().expect(1, &[&dead, "nobody took its place within 1 s", "commands of step"]);
     coordinator.ended().expect(1, &["the world", "gone"]);
     drop(controller);
-    site.assert_clean();
+    test_run.assert_clean();
 }

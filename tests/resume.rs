@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{LONG_RUN, Process, Site, children, is_alive, part, send, wait_until};
+use common::{LONG_RUN, Process, TestRun, children, is_alive, part, send, wait_until};
 use control_zones::record::{Reader, Writer};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -13,16 +13,21 @@ use std::path::{Path, PathBuf};
 use std::process::{Output, Stdio};
 use std::time::Duration;
 
-fn in_process(site: &Site, arguments: &[&str]) -> String {
-    common::hash(&site.summary(&[arguments, &["--in-process"]].concat()))
+fn in_process(test_run: &TestRun, arguments: &[&str]) -> String {
+    common::hash(&test_run.summary(&[arguments, &["--in-process"]].concat()))
 }
 
-fn begin(site: &Site, arguments: &[&str], file: &Path, processes: usize) -> (Process, Vec<(String, u32)>) {
-    common::begin(site, &[arguments, &["--record", file.to_str().unwrap()]].concat(), processes)
+fn begin(
+    test_run: &TestRun,
+    arguments: &[&str],
+    file: &Path,
+    processes: usize,
+) -> (Process, Vec<(String, u32)>) {
+    common::begin(test_run, &[arguments, &["--record", file.to_str().unwrap()]].concat(), processes)
 }
 
-fn cz(site: &Site, arguments: &[&str]) -> Output {
-    site.command("cz").args(arguments).output().unwrap()
+fn cz(test_run: &TestRun, arguments: &[&str]) -> Output {
+    test_run.command("cz").args(arguments).output().unwrap()
 }
 
 fn text(bytes: &[u8]) -> String {
@@ -30,8 +35,8 @@ fn text(bytes: &[u8]) -> String {
 }
 
 /// Resumes a recording and returns the hash the run ends with.
-fn resumed(site: &Site, file: &Path) -> String {
-    let output = cz(site, &["resume", file.to_str().unwrap(), "--json", "-"]);
+fn resumed(test_run: &TestRun, file: &Path) -> String {
+    let output = cz(test_run, &["resume", file.to_str().unwrap(), "--json", "-"]);
     assert!(output.status.success(), "{output:?}");
     common::hash(&serde_json::from_slice(&output.stdout).unwrap())
 }
@@ -44,13 +49,13 @@ fn file(directory: &tempfile::TempDir) -> PathBuf {
 /// Kills the world, or the supervisor, that many times at random instants of a run each, and resumes.
 fn cut_short(times: usize, victim: &str, shares: &[&str], processes: usize) {
     let mut rng = ChaCha8Rng::seed_from_u64(7);
-    let reference = Site::new("u");
+    let reference = TestRun::new("u");
     let expected = in_process(&reference, &LONG_RUN);
     let mut steps = Vec::new();
     while steps.len() < times {
         let directory = tempfile::tempdir().unwrap();
-        let (site, file) = (Site::new("cut"), file(&directory));
-        let (supervisor, parts) = begin(&site, &[&LONG_RUN[..], shares].concat(), &file, processes);
+        let (test_run, file) = (TestRun::new("cut"), file(&directory));
+        let (supervisor, parts) = begin(&test_run, &[&LONG_RUN[..], shares].concat(), &file, processes);
         let world = part(&parts, "world");
         // Before its first step there is nothing to go on from.
         wait_until("the world to be stepping", || file.exists() || !is_alive(world));
@@ -64,13 +69,13 @@ fn cut_short(times: usize, victim: &str, shares: &[&str], processes: usize) {
             continue; // it was over before
         }
         wait_until("the others to end", || parts.iter().all(|(_, id)| !is_alive(*id)));
-        let shown = cz(&site, &["show", file.to_str().unwrap()]);
+        let shown = cz(&test_run, &["show", file.to_str().unwrap()]);
         assert!(shown.status.success(), "{shown:?}");
-        assert_eq!(resumed(&site, &file), expected, "{ended:?}");
-        let said = text(&cz(&site, &["show", file.to_str().unwrap(), "--json"]).stdout);
+        assert_eq!(resumed(&test_run, &file), expected, "{ended:?}");
+        let said = text(&cz(&test_run, &["show", file.to_str().unwrap(), "--json"]).stdout);
         steps.push(serde_json::from_str::<serde_json::Value>(&said).unwrap()["steps"].as_u64().unwrap());
-        assert!(cz(&site, &["clean"]).status.success());
-        site.assert_clean();
+        assert!(cz(&test_run, &["clean"]).status.success());
+        test_run.assert_clean();
     }
     println!("{victim} {shares:?}: killed after {steps:?} steps; resumed to the same hash each time");
 }
@@ -95,10 +100,10 @@ fn cut_short_twenty_times_each() {
 }
 
 /// Starts `cz resume FILE --record OUT` and kills its world in the middle.
-fn resume_cut_short(site: &Site, file: &Path, out: &Path) {
+fn resume_cut_short(test_run: &TestRun, file: &Path, out: &Path) {
     let arguments = ["resume", file.to_str().unwrap(), "--record", out.to_str().unwrap()];
     let mut supervisor =
-        site.command("cz").args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
+        test_run.command("cz").args(arguments).stdout(Stdio::null()).stderr(Stdio::null()).spawn().unwrap();
     let past = steps_in(file);
     wait_until("the resumed run to be ahead of its past", || {
         assert!(supervisor.try_wait().unwrap().is_none(), "the resumed run was over before it was killed");
@@ -124,47 +129,48 @@ fn missed_in(file: &Path) -> usize {
 
 #[test]
 fn a_resumed_run_is_recorded_with_its_past_and_can_be_resumed_again() {
-    let (site, directory) = (Site::new("rr"), tempfile::tempdir().unwrap());
+    let (test_run, directory) = (TestRun::new("rr"), tempfile::tempdir().unwrap());
     let path = |name: &str| directory.path().join(name);
     let (undisturbed, first, second, last) = (path("u"), path("1"), path("2"), path("3"));
     let of = |path: &Path| path.to_str().unwrap().to_owned();
-    let expected = common::hash(&site.summary(&[&LONG_RUN[..], &["--record", &of(&undisturbed)]].concat()));
-    let (supervisor, parts) = begin(&site, &LONG_RUN, &first, 3);
+    let expected =
+        common::hash(&test_run.summary(&[&LONG_RUN[..], &["--record", &of(&undisturbed)]].concat()));
+    let (supervisor, parts) = begin(&test_run, &LONG_RUN, &first, 3);
     wait_until("the run to be under way", || steps_in(&first) > 1000);
     send(part(&parts, "world"), Signal::KILL);
     assert!(!supervisor.ended().status.success());
     wait_until("the others to end", || parts.iter().all(|(_, id)| !is_alive(*id)));
-    resume_cut_short(&site, &first, &second);
-    let output = cz(&site, &["resume", &of(&second), "--record", &of(&last), "--json", "-"]);
+    resume_cut_short(&test_run, &first, &second);
+    let output = cz(&test_run, &["resume", &of(&second), "--record", &of(&last), "--json", "-"]);
     assert!(output.status.success(), "{output:?}");
     assert_eq!(common::hash(&serde_json::from_slice(&output.stdout).unwrap()), expected);
     // The last recording is one of the whole run, and nothing in it tells that it was interrupted twice.
-    let output = cz(&site, &["verify", &of(&undisturbed), &of(&last)]);
+    let output = cz(&test_run, &["verify", &of(&undisturbed), &of(&last)]);
     assert!(output.status.success(), "{output:?}");
-    let output = cz(&site, &["replay", &of(&last)]);
+    let output = cz(&test_run, &["replay", &of(&last)]);
     assert!(output.status.success() && text(&output.stdout).contains(&expected), "{output:?}");
-    let output = cz(&site, &["show", &of(&last)]);
+    let output = cz(&test_run, &["show", &of(&last)]);
     assert!(output.status.success(), "{output:?}");
     let reader = Reader::open(&last).unwrap();
     let run_id = reader.metadata().run_id;
     assert!(reader.steps().all(|step| step.unwrap().header.run_id == run_id));
     assert_ne!(run_id, Reader::open(&first).unwrap().metadata().run_id);
-    assert!(cz(&site, &["clean"]).status.success());
-    site.assert_clean();
+    assert!(cz(&test_run, &["clean"]).status.success());
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_resumed_run_is_not_recorded_over_its_own_past() {
-    let (site, directory) = (Site::new("own"), tempfile::tempdir().unwrap());
+    let (test_run, directory) = (TestRun::new("own"), tempfile::tempdir().unwrap());
     let file = file(&directory);
-    site.summary(&["--in-process", "--record", file.to_str().unwrap()]);
+    test_run.summary(&["--in-process", "--record", file.to_str().unwrap()]);
     let whole = std::fs::read(&file).unwrap();
     let cut = &whole[..whole.len() / 2];
     std::fs::write(&file, cut).unwrap();
     let alias = directory.path().join("alias.czlog");
     std::os::unix::fs::symlink(&file, &alias).unwrap();
     for out in [&file, &alias] {
-        let output = cz(&site, &["resume", file.to_str().unwrap(), "--record", out.to_str().unwrap()]);
+        let output = cz(&test_run, &["resume", file.to_str().unwrap(), "--record", out.to_str().unwrap()]);
         assert_eq!(output.status.code(), Some(2), "{output:?}");
         let said = text(&output.stderr);
         assert!(said.contains("--record") && said.contains("another file"), "{said}");
@@ -174,12 +180,12 @@ fn a_resumed_run_is_not_recorded_over_its_own_past() {
 
 #[test]
 fn a_run_cut_off_behind_a_missed_step_goes_on_as_if_it_had_not_been() {
-    let (site, directory) = (Site::new("mc"), tempfile::tempdir().unwrap());
+    let (test_run, directory) = (TestRun::new("mc"), tempfile::tempdir().unwrap());
     let (file, cut, out) =
         (file(&directory), directory.path().join("cut.czlog"), directory.path().join("out.czlog"));
     // Nobody waits for its end.
     let arguments = [&paced("end.time_s=300")[..], &["--on-miss", "hold", "--record-lag", "wait"]].concat();
-    let (supervisor, parts) = begin(&site, &arguments, &file, 3);
+    let (supervisor, parts) = begin(&test_run, &arguments, &file, 3);
     wait_until("vehicles to be on the road", || steps_in(&file) > 250);
     send(part(&parts, "ctrl"), Signal::STOP);
     wait_until("a missed step to be recorded", || missed_in(&file) > 0);
@@ -197,50 +203,50 @@ fn a_run_cut_off_behind_a_missed_step_goes_on_as_if_it_had_not_been() {
         }
     };
     drop(writer);
-    let output = cz(&site, &["resume", cut.to_str().unwrap(), "--record", out.to_str().unwrap()]);
+    let output = cz(&test_run, &["resume", cut.to_str().unwrap(), "--record", out.to_str().unwrap()]);
     assert!(output.status.success(), "{output:?}");
-    let output = cz(&site, &["replay", out.to_str().unwrap()]);
+    let output = cz(&test_run, &["replay", out.to_str().unwrap()]);
     assert!(output.status.success(), "missed step {missed}: {output:?}");
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_run_that_is_complete_cannot_be_resumed() {
-    let (site, directory) = (Site::new("c"), tempfile::tempdir().unwrap());
+    let (test_run, directory) = (TestRun::new("c"), tempfile::tempdir().unwrap());
     let file = file(&directory);
-    let summary = site.summary(&["--record", file.to_str().unwrap()]);
-    let output = cz(&site, &["resume", file.to_str().unwrap()]);
+    let summary = test_run.summary(&["--record", file.to_str().unwrap()]);
+    let output = cz(&test_run, &["resume", file.to_str().unwrap()]);
     assert_eq!(output.status.code(), Some(2), "{output:?}");
     assert!(text(&output.stderr).contains("the run is complete"), "{output:?}");
     // It replays to the hash it ended with.
-    let output = cz(&site, &["replay", file.to_str().unwrap()]);
+    let output = cz(&test_run, &["replay", file.to_str().unwrap()]);
     assert!(output.status.success(), "{output:?}");
     assert!(text(&output.stdout).contains(&common::hash(&summary)), "{output:?}");
 }
 
 #[test]
 fn processes_and_one_process_record_the_same() {
-    let (site, directory) = (Site::new("s"), tempfile::tempdir().unwrap());
+    let (test_run, directory) = (TestRun::new("s"), tempfile::tempdir().unwrap());
     let one = directory.path().join("one.czlog");
-    site.summary(&["tree", "--in-process", "--record", one.to_str().unwrap()]);
+    test_run.summary(&["tree", "--in-process", "--record", one.to_str().unwrap()]);
     for (i, shares) in [&[][..], &["--ctrl-procs", "2", "--coord-procs", "2"]].into_iter().enumerate() {
         let many = directory.path().join(format!("{i}.czlog"));
-        site.summary(&[&["tree", "--record", many.to_str().unwrap()], shares].concat());
-        let output = cz(&site, &["verify", one.to_str().unwrap(), many.to_str().unwrap()]);
+        test_run.summary(&[&["tree", "--record", many.to_str().unwrap()], shares].concat());
+        let output = cz(&test_run, &["verify", one.to_str().unwrap(), many.to_str().unwrap()]);
         assert!(output.status.success(), "{output:?}");
-        let output = cz(&site, &["replay", many.to_str().unwrap()]);
+        let output = cz(&test_run, &["replay", many.to_str().unwrap()]);
         assert!(output.status.success(), "{output:?}");
     }
 }
 
 #[test]
 fn a_branch_shares_the_past_and_not_the_future() {
-    let (site, directory) = (Site::new("b"), tempfile::tempdir().unwrap());
+    let (test_run, directory) = (TestRun::new("b"), tempfile::tempdir().unwrap());
     let file = file(&directory);
-    let whole = common::hash(&site.summary(&["--record", file.to_str().unwrap()]));
+    let whole = common::hash(&test_run.summary(&["--record", file.to_str().unwrap()]));
     let branch = |at: &str, set: &str| {
         let path = file.to_str().unwrap();
-        cz(&site, &["branch", path, "--at", at, "--set", set, "--json"])
+        cz(&test_run, &["branch", path, "--at", at, "--set", set, "--json"])
     };
     let output = branch("1500", "coordination.price_of_time=0");
     assert!(output.status.success(), "{output:?}");
@@ -272,13 +278,13 @@ fn paced(end: &str) -> [&str; 11] {
 #[test]
 fn a_stopped_controller_is_dealt_with_as_the_policy_says_and_replayed_alike() {
     for policy in ["wait", "hold", "shield-fallback", "abort"] {
-        let (site, directory) = (Site::new("miss"), tempfile::tempdir().unwrap());
+        let (test_run, directory) = (TestRun::new("miss"), tempfile::tempdir().unwrap());
         let file = file(&directory);
         // A machine with much else to do must not end the run before anybody is stopped.
         let deadline = if policy == "abort" { "2" } else { "0.01" };
         let conduct = ["--on-miss", policy, "--deadline", deadline, "--record-lag", "wait"];
         let arguments = [&paced("end.time_s=8")[..], &conduct].concat();
-        let (supervisor, parts) = begin(&site, &arguments, &file, 3);
+        let (supervisor, parts) = begin(&test_run, &arguments, &file, 3);
         let controller = part(&parts, "ctrl");
         wait_until("vehicles to be on the road", || steps_in(&file) > 250);
         send(controller, Signal::STOP);
@@ -303,23 +309,23 @@ fn a_stopped_controller_is_dealt_with_as_the_policy_says_and_replayed_alike() {
             if policy != "wait" {
                 assert!(by[0]["steps"].as_u64().unwrap() >= 10, "{summary}");
             }
-            let replay = cz(&site, &["replay", file.to_str().unwrap()]);
+            let replay = cz(&test_run, &["replay", file.to_str().unwrap()]);
             assert!(replay.status.success(), "{policy}: {replay:?}");
             assert!(text(&replay.stdout).contains(&common::hash(&summary)), "{policy}: {replay:?}");
             assert_eq!(text(&replay.stdout).contains("did not answer in time"), policy != "wait");
         }
-        site.assert_clean();
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn a_paced_run_has_the_hash_of_a_free_one() {
-    let site = Site::new("pace");
+    let test_run = TestRun::new("pace");
     let free: Vec<&str> =
         paced("end.time_s=4").into_iter().filter(|a| !["--pace", "realtime"].contains(a)).collect();
-    let expected = common::hash(&site.start("cz", &free).ended().json());
+    let expected = common::hash(&test_run.start("cz", &free).ended().json());
     let summary =
-        site.start("cz", &[&paced("end.time_s=4")[..], &["--deadline", "10"]].concat()).ended().json();
+        test_run.start("cz", &[&paced("end.time_s=4")[..], &["--deadline", "10"]].concat()).ended().json();
     assert_eq!(common::hash(&summary), expected);
     assert_eq!(summary["punctuality"]["lateness_ns"]["count"], 401);
     assert!(summary["wall_s"].as_f64().unwrap() >= 4.0, "{summary}");
@@ -327,8 +333,8 @@ fn a_paced_run_has_the_hash_of_a_free_one() {
 
 #[test]
 fn a_policy_without_a_deadline_is_refused() {
-    let site = Site::new("pol");
-    let output = cz(&site, &["run", "--on-miss", "hold"]);
+    let test_run = TestRun::new("pol");
+    let output = cz(&test_run, &["run", "--on-miss", "hold"]);
     assert_eq!(output.status.code(), Some(2), "{output:?}");
     assert!(text(&output.stderr).contains("--deadline"), "{output:?}");
 }

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Site, begin, hash, is_alive, part, send, wait_until};
+use common::{TestRun, begin, hash, is_alive, part, send, wait_until};
 use control_zones::record::{Reader, Writer};
 use rustix::process::Signal;
 use serde_json::Value;
@@ -35,9 +35,9 @@ fn run(scenario: &str, seed: u64, arguments: &[&str]) -> Value {
     let mut all = vec![scenario, "--seed", &seed];
     all.extend(arguments);
     let _alone = PROCESSES.lock();
-    let site = Site::new("h");
-    let summary = site.summary(&all);
-    site.assert_clean();
+    let test_run = TestRun::new("h");
+    let summary = test_run.summary(&all);
+    test_run.assert_clean();
     summary
 }
 
@@ -210,8 +210,8 @@ fn steps_in(file: &Path) -> u64 {
     Reader::open(file).map_or(0, |reader| reader.steps().map_while(Result::ok).count() as u64)
 }
 
-fn cz(site: &Site, arguments: &[&str]) -> String {
-    let output = site.command("cz").args(arguments).output().unwrap();
+fn cz(test_run: &TestRun, arguments: &[&str]) -> String {
+    let output = test_run.command("cz").args(arguments).output().unwrap();
     assert!(output.status.success(), "{arguments:?}: {output:?}");
     String::from_utf8(output.stdout).unwrap()
 }
@@ -220,17 +220,17 @@ fn cz(site: &Site, arguments: &[&str]) -> String {
 /// the world killed in the middle.
 fn check_disturbed(scenario: &str) {
     let _alone = PROCESSES.lock();
-    let (site, folder) = (Site::new("w"), tempfile::tempdir().unwrap());
+    let (test_run, folder) = (TestRun::new("w"), tempfile::tempdir().unwrap());
     let path = |name: &str| folder.path().join(name);
     let arguments = long(scenario);
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     let (whole, cut, killed) = (path("whole.czlog"), path("cut.czlog"), path("killed.czlog"));
     let [whole_path, cut_path, killed_path] = [&whole, &cut, &killed].map(|p| p.to_str().unwrap());
-    let expected = hash(&site.summary(&[&arguments[..], &["--in-process"]].concat()));
+    let expected = hash(&test_run.summary(&[&arguments[..], &["--in-process"]].concat()));
 
     // Processes that are killed are replaced, and it is recorded as if nothing had been.
     let json = ["--json", "-", "--record", whole_path];
-    let (supervisor, parts) = begin(&site, &[&arguments[..], &json].concat(), 3);
+    let (supervisor, parts) = begin(&test_run, &[&arguments[..], &json].concat(), 3);
     for (victim, after) in [("ctrl", 500), ("coord", 1500)] {
         wait_until("the run to be under way", || steps_in(&whole) > after);
         let id = part(&parts, victim);
@@ -240,7 +240,7 @@ fn check_disturbed(scenario: &str) {
     let summary = supervisor.ended().json();
     assert_eq!(hash(&summary), expected, "{scenario}: controller and coordinator killed");
     assert_eq!(summary["replacements"].as_array().unwrap().len(), 2, "{scenario}: {summary}");
-    assert!(cz(&site, &["replay", whole_path]).contains(&expected), "{scenario}: replay");
+    assert!(cz(&test_run, &["replay", whole_path]).contains(&expected), "{scenario}: replay");
 
     // Cut off in the middle of the file.
     let reader = Reader::open(&whole).unwrap();
@@ -248,28 +248,29 @@ fn check_disturbed(scenario: &str) {
     let mut writer = Writer::new(std::fs::File::create(&cut).unwrap(), reader.metadata()).unwrap();
     steps[..steps.len() / 3].iter().for_each(|step| writer.append(&step.encode()).unwrap());
     drop(writer);
-    let resumed: Value = serde_json::from_str(&cz(&site, &["resume", cut_path, "--json", "-"])).unwrap();
+    let resumed: Value = serde_json::from_str(&cz(&test_run, &["resume", cut_path, "--json", "-"])).unwrap();
     assert_eq!(hash(&resumed), expected, "{scenario}: resumed");
 
     // Branched with a change that is none.
     let at = (steps.len() / 2).to_string();
     let same = ["branch", whole_path, "--at", &at, "--set", "control.k_merge_per_s=1.0", "--json"];
-    let both: Value = serde_json::from_str(&cz(&site, &same)).unwrap();
+    let both: Value = serde_json::from_str(&cz(&test_run, &same)).unwrap();
     for side in ["as_recorded", "branched"] {
         let found = format!("{:016x}", both[side]["state_hash"].as_u64().unwrap());
         assert_eq!(found, expected, "{scenario}: {side}");
     }
 
     // The world killed, and the run resumed.
-    let (supervisor, parts) = begin(&site, &[&arguments[..], &["--record", killed_path]].concat(), 3);
+    let (supervisor, parts) = begin(&test_run, &[&arguments[..], &["--record", killed_path]].concat(), 3);
     wait_until("the run to be under way", || steps_in(&killed) > 800);
     send(part(&parts, "world"), Signal::KILL);
     assert!(!supervisor.ended().status.success(), "{scenario}: over before the world was killed");
     wait_until("the others to end", || parts.iter().all(|(_, id)| !is_alive(*id)));
-    let resumed: Value = serde_json::from_str(&cz(&site, &["resume", killed_path, "--json", "-"])).unwrap();
+    let resumed: Value =
+        serde_json::from_str(&cz(&test_run, &["resume", killed_path, "--json", "-"])).unwrap();
     assert_eq!(hash(&resumed), expected, "{scenario}: resumed after the world was killed");
-    cz(&site, &["clean"]);
-    site.assert_clean();
+    cz(&test_run, &["clean"]);
+    test_run.assert_clean();
 }
 
 #[test]

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{Site, children, hash, send, ticks, wait_until};
+use common::{TestRun, children, hash, send, ticks, wait_until};
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{Override, Scenario, load};
 use control_zones::world::{FaultCounts, World, WorldSummary};
@@ -117,11 +117,11 @@ fn a_controller_cannot_claim_the_worlds_own_verdicts() {
 #[test]
 fn the_number_of_processes_changes_nothing() {
     let run = |arguments: &[&str]| {
-        let site = Site::new("sf");
+        let test_run = TestRun::new("sf");
         let mut all = vec!["faulty-sensors", "--set", "end.vehicles=80"];
         all.extend(arguments);
-        let summary = site.summary(&all);
-        site.assert_clean();
+        let summary = test_run.summary(&all);
+        test_run.assert_clean();
         summary
     };
     let expected = run(&["--in-process"]);
@@ -160,10 +160,11 @@ fn a_killed_participant_is_replaced_without_a_trace() {
     sets.extend(EVERYTHING.map(str::to_owned));
     let mut arguments = vec!["varying-demand", "--set", "end.time_s=10000", "--json", "-"];
     arguments.extend(sets.iter().flat_map(|set| ["--set", set.as_str()]));
-    let expected = Site::new("sf").start("cz", &[&arguments[..], &["--in-process"]].concat()).ended().json();
+    let expected =
+        TestRun::new("sf").start("cz", &[&arguments[..], &["--in-process"]].concat()).ended().json();
     for victim in ["ctrl", "coord"] {
-        let site = Site::new("sf");
-        let supervisor = site.start("cz", &arguments);
+        let test_run = TestRun::new("sf");
+        let supervisor = test_run.start("cz", &arguments);
         let mut target = None;
         wait_until("the run to be in the middle of things", || {
             let parts = children(supervisor.id());
@@ -176,19 +177,19 @@ fn a_killed_participant_is_replaced_without_a_trace() {
         assert_eq!(summary["replacements"].as_array().unwrap().len(), 1, "{summary}");
         assert_eq!(hash(&summary), hash(&expected), "{victim}");
         assert_eq!(summary["faults"], expected["faults"], "{victim}");
-        site.assert_clean();
+        test_run.assert_clean();
     }
 }
 
 #[test]
 fn the_table_has_a_line_only_when_there_are_faults() {
-    let site = Site::new("sf");
+    let test_run = TestRun::new("sf");
     for (scenario, has_line) in [("two-merges", false), ("faulty-sensors", true)] {
-        let ended = site.start("cz", &[scenario, "--in-process", "--set", "end.vehicles=5"]).ended();
+        let ended = test_run.start("cz", &[scenario, "--in-process", "--set", "end.vehicles=5"]).ended();
         ended.expect(0, &[]);
         assert_eq!(ended.out.contains("\nfaults: commands "), has_line, "{ended:?}");
     }
-    let summary = site.summary(&["two-merges", "--in-process", "--set", "end.vehicles=5"]);
+    let summary = test_run.summary(&["two-merges", "--in-process", "--set", "end.vehicles=5"]);
     assert!(summary.get("faults").is_none(), "{summary}");
 }
 
@@ -556,13 +557,13 @@ fn no_measurement_makes_a_controller_fail() {
 
 #[test]
 fn a_recorded_run_replays() {
-    let site = Site::new("sf");
+    let test_run = TestRun::new("sf");
     let directory = tempfile::tempdir().unwrap();
     let file = directory.path().join("run.czlog");
     let file = file.to_str().unwrap();
     let summary =
-        site.summary(&["faulty-sensors", "--in-process", "--set", "end.vehicles=60", "--record", file]);
-    let output = site.command("cz").args(["replay", file]).output().unwrap();
+        test_run.summary(&["faulty-sensors", "--in-process", "--set", "end.vehicles=60", "--record", file]);
+    let output = test_run.command("cz").args(["replay", file]).output().unwrap();
     let text = String::from_utf8_lossy(&output.stdout);
     assert!(output.status.success(), "{output:?}");
     assert!(text.contains(&hash(&summary)), "{text}");

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::Site;
+use common::TestRun;
 use control_zones::record::{Reader, Writer};
 use std::path::Path;
 
@@ -18,11 +18,11 @@ const SHORT: [&[&str]; 4] = [
 
 fn short_runs(times: usize) {
     for arguments in SHORT {
-        let expected = common::hash(&Site::new("u").summary(&in_process(arguments)));
+        let expected = common::hash(&TestRun::new("u").summary(&in_process(arguments)));
         for _ in 0..times {
-            let site = Site::new("short");
-            assert_eq!(common::hash(&site.summary(arguments)), expected, "{arguments:?}");
-            site.assert_clean();
+            let test_run = TestRun::new("short");
+            assert_eq!(common::hash(&test_run.summary(arguments)), expected, "{arguments:?}");
+            test_run.assert_clean();
         }
         println!("{times} of {times}: {arguments:?}");
     }
@@ -50,19 +50,19 @@ fn cut(file: &Path, steps: usize, to: &Path) {
 }
 
 fn late_resumes(times: usize) {
-    let site = Site::new("late");
+    let test_run = TestRun::new("late");
     let directory = tempfile::tempdir().unwrap();
     let (whole, part) = (directory.path().join("whole.czlog"), directory.path().join("part.czlog"));
     let arguments =
         ["tree", "--coord-procs", "3", "--ctrl-procs", "2", "--set", "end.time_s=30", "--in-process"];
     let expected =
-        common::hash(&site.summary(&[&arguments[..], &["--record", whole.to_str().unwrap()]].concat()));
+        common::hash(&test_run.summary(&[&arguments[..], &["--record", whole.to_str().unwrap()]].concat()));
     let steps = Reader::open(&whole).unwrap().steps().count();
     for i in 0..times {
         // Five steps or fewer are left, the last one among them, which nobody answers.
         cut(&whole, steps - 1 - i % 5, &part);
         let output =
-            site.command("cz").args(["resume", part.to_str().unwrap(), "--json", "-"]).output().unwrap();
+            test_run.command("cz").args(["resume", part.to_str().unwrap(), "--json", "-"]).output().unwrap();
         assert!(output.status.success(), "{} steps left: {output:?}", 1 + i % 5);
         let summary = serde_json::from_slice(&output.stdout).unwrap();
         assert_eq!(common::hash(&summary), expected, "{} steps left", 1 + i % 5);

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{LONG_RUN, Site, part, send, ticks, wait_until};
+use common::{LONG_RUN, TestRun, part, send, ticks, wait_until};
 use rustix::process::Signal;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -43,11 +43,11 @@ fn lanes(path: &Path) -> Vec<Lane> {
 
 #[test]
 fn every_step_of_every_process_is_in_a_trace() {
-    let site = Site::new("trace");
+    let test_run = TestRun::new("trace");
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("a.json");
     let arguments = ["two-merges", "--set", "end.vehicles=10", "--trace", path.to_str().unwrap()];
-    let steps = site.summary(&arguments)["steps"].as_u64().unwrap();
+    let steps = test_run.summary(&arguments)["steps"].as_u64().unwrap();
     let lanes = lanes(&path);
     let names: Vec<&str> = lanes.iter().map(|lane| lane.name.as_str()).collect();
     for name in ["world", "coordinator 0", "controller 0"] {
@@ -76,11 +76,11 @@ fn every_step_of_every_process_is_in_a_trace() {
 
 #[test]
 fn who_is_replaced_is_in_the_trace_of_the_world() {
-    let site = Site::new("trace");
+    let test_run = TestRun::new("trace");
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("a.json");
     let arguments = [&LONG_RUN[..], &["--json", "-", "--trace", path.to_str().unwrap()]].concat();
-    let (supervisor, parts) = common::begin(&site, &arguments, 3);
+    let (supervisor, parts) = common::begin(&test_run, &arguments, 3);
     let world = part(&parts, "world");
     wait_until("the world to be stepping", || ticks(world) >= 5);
     send(part(&parts, "ctrl"), Signal::KILL);

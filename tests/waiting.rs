@@ -4,49 +4,50 @@
 
 mod common;
 
-use common::{LONG_RUN, Site, hash, wait_until};
+use common::{LONG_RUN, TestRun, hash, wait_until};
 use std::io::{Seek, Write};
 
 const MODES: [&str; 3] = ["adaptive", "hybrid", "block"];
 
 #[test]
 fn states_are_the_same_however_processes_wait() {
-    let site = Site::new("wait");
+    let test_run = TestRun::new("wait");
     for (scenario, shares) in
         [("two-merges", &[][..]), ("corridor-8", &["--coord-procs", "3", "--ctrl-procs", "4"])]
     {
-        let alone = site.summary(&[&[scenario, "--in-process"][..], shares].concat());
-        let default = site.summary(&[&[scenario][..], shares].concat());
+        let alone = test_run.summary(&[&[scenario, "--in-process"][..], shares].concat());
+        let default = test_run.summary(&[&[scenario][..], shares].concat());
         assert_eq!(hash(&default), hash(&alone), "{scenario}");
         for mode in MODES {
-            let summary = site.summary(&[&[scenario, "--wait", mode][..], shares].concat());
+            let summary = test_run.summary(&[&[scenario, "--wait", mode][..], shares].concat());
             assert_eq!(hash(&summary), hash(&alone), "{scenario}, {mode}");
         }
     }
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_paced_run_in_which_everybody_sleeps_has_all_its_steps() {
-    let site = Site::new("paced");
+    let test_run = TestRun::new("paced");
     for mode in MODES {
         let arguments = ["two-merges", "--wait", mode, "--pace", "realtime", "--set", "dt_s=0.01"];
         let end = ["--set", "end.time_s=1", "--set", "end.vehicles=600"];
-        let summary = site.summary(&[&arguments[..], &end].concat());
+        let summary = test_run.summary(&[&arguments[..], &end].concat());
         assert_eq!(summary["steps"], 100, "{mode}: {summary}");
     }
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn what_a_stranger_writes_to_the_bells_changes_nothing() {
-    let site = Site::new("bells");
+    let test_run = TestRun::new("bells");
     for mode in ["adaptive", "block"] {
-        let expected = site.summary(&[&LONG_RUN[..], &["--set", "end.time_s=2000", "--in-process"]].concat());
+        let expected =
+            test_run.summary(&[&LONG_RUN[..], &["--set", "end.time_s=2000", "--in-process"]].concat());
         let arguments =
             [&["--json", "-", "--wait", mode][..], &LONG_RUN, &["--set", "end.time_s=2000"]].concat();
-        let run = site.start("cz", &arguments);
-        let bells = || site.files().into_iter().find(|path| path.to_string_lossy().ends_with("_bells"));
+        let run = test_run.start("cz", &arguments);
+        let bells = || test_run.files().into_iter().find(|path| path.to_string_lossy().ends_with("_bells"));
         wait_until("the run to have bells", || bells().is_some());
         let mut file = std::fs::OpenOptions::new().write(true).open(bells().unwrap()).unwrap();
         let length = file.metadata().unwrap().len() as usize;
@@ -57,5 +58,5 @@ fn what_a_stranger_writes_to_the_bells_changes_nothing() {
         let summary = run.ended().json();
         assert_eq!(hash(&summary), hash(&expected), "{mode}");
     }
-    site.assert_clean();
+    test_run.assert_clean();
 }

@@ -9,7 +9,7 @@ use crate::lockstep::{Handover, Seat};
 use crate::own_time::Bound;
 use crate::scenario::{Drivers, Scenario, decode, scenario_hash};
 use crate::transport::TransportError;
-use crate::transport::iox::{AttachDesk, AttachLine, Bells, RunName, RunSpace, SpaceError};
+use crate::transport::iox::{AttachLine, AttachServer, Bells, RunName, RunSpace, SpaceError};
 use ipc_schemas::{self as frames, AttachReply, AttachRequest, Role, schema_hash};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -219,10 +219,10 @@ fn refusal(request: &AttachRequest, reply: &AttachReply, plugins: &str) -> Strin
     }
 }
 
-/// The world's side: a desk at which participants ask for their places.
+/// The world's side: a server at which participants ask for their places.
 #[derive(Debug)]
 pub(super) struct Reception {
-    desk: AttachDesk,
+    server: AttachServer,
     run_id: u64,
     scenario: Vec<u8>,
     scenario_hash: u64,
@@ -267,7 +267,7 @@ impl Reception {
         let longest = plugins.iter().map(Vec::len).max().unwrap_or(0).max(bytes.len());
         let hash = scenario_hash(scenario);
         Ok(Reception {
-            desk: space.create_attach_desk((coordinators + controllers) as usize, longest)?,
+            server: space.create_attach_server((coordinators + controllers) as usize, longest)?,
             seating: Seating::new(hash, coordinators as usize, controllers as usize, names),
             plugins,
             first_step: 0,
@@ -290,7 +290,7 @@ impl Reception {
         for request in std::mem::take(&mut self.pending) {
             self.answer(request, hand_over)?;
         }
-        while let Some(request) = self.desk.next_request()? {
+        while let Some(request) = self.server.next_request()? {
             self.pending.retain(|p| p.instance != request.instance);
             self.answer(request, hand_over)?;
         }
@@ -324,7 +324,7 @@ impl Reception {
         };
         let Judgement::Seated { role, plugin, .. } = judgement else {
             let reason = refusal(&request, &reply, &self.plugin_names);
-            self.desk.reply(reply, reason.as_bytes())?;
+            self.server.reply(reply, reason.as_bytes())?;
             self.last_refusal = Some(reason);
             return Ok(());
         };
@@ -332,20 +332,20 @@ impl Reception {
         let seat = Seat::new(generation, request.process_id);
         let handed = if joins { Readiness::Begin } else { hand_over(role, index, seat) };
         match handed {
-            _ if joins => self.desk.reply(reply, plugin.map_or(&self.scenario, |p| &self.plugins[p])),
-            Readiness::Begin => self.desk.reply(reply, &[]),
+            _ if joins => self.server.reply(reply, plugin.map_or(&self.scenario, |p| &self.plugins[p])),
+            Readiness::Begin => self.server.reply(reply, &[]),
             Readiness::Later => {
                 self.pending.push(request);
                 Ok(())
             }
             Readiness::Now(handover) if plugin.is_some() => {
                 let (first_step, assignments) = handover.assignments();
-                self.desk.reply(AttachReply { first_step, ..reply }, frames::bytes_of(&assignments))
+                self.server.reply(AttachReply { first_step, ..reply }, frames::bytes_of(&assignments))
             }
             Readiness::Now(handover) => {
                 let mut bytes = Vec::new();
                 encoding::encode_onto(&mut bytes, &handover);
-                self.desk.reply(reply, &bytes)
+                self.server.reply(reply, &bytes)
             }
         }
     }

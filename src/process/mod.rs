@@ -1,7 +1,7 @@
 //! The processes of a run: thin shells that give the pure roles a clock, signals and a transport.
 
 mod attach;
-mod house;
+mod membership;
 mod observe;
 mod outcome;
 mod pace;

@@ -49,15 +49,15 @@ pub(super) struct Services {
 
 /// The world's word on who has which place.
 #[derive(Debug)]
-pub(super) struct MembersDesk {
+pub(super) struct MembersOutbox {
     outbox: IoxOutbox<Member>,
     run_id: u64,
 }
 
-impl MembersDesk {
+impl MembersOutbox {
     /// Opens it.
-    pub(super) fn open(service: &Service<Member>, run_id: u64) -> Result<MembersDesk, SpaceError> {
-        Ok(MembersDesk { outbox: service.outbox(8)?, run_id })
+    pub(super) fn open(service: &Service<Member>, run_id: u64) -> Result<MembersOutbox, SpaceError> {
+        Ok(MembersOutbox { outbox: service.outbox(8)?, run_id })
     }
 
     /// How many may listen to it, and what they get: only the last word counts.
@@ -107,7 +107,7 @@ impl Services {
             coordination: space
                 .create(frames::SERVICE_COORDINATION, limits(m + STRANGERS, n + usize::from(keeps)))?,
             keeps,
-            members: space.create(frames::SERVICE_MEMBERS, MembersDesk::limits(m + n, nodes))?,
+            members: space.create(frames::SERVICE_MEMBERS, MembersOutbox::limits(m + n, nodes))?,
             _summaries: (0..m)
                 .map(|i| {
                     let name = format!("{}{i}", frames::SERVICE_SUMMARY_PREFIX);
@@ -146,8 +146,8 @@ impl Services {
     }
 
     /// The world's word on who has which place.
-    pub(super) fn members_desk(&self, run_id: u64) -> Result<MembersDesk, SpaceError> {
-        MembersDesk::open(&self.members, run_id)
+    pub(super) fn members_outbox(&self, run_id: u64) -> Result<MembersOutbox, SpaceError> {
+        MembersOutbox::open(&self.members, run_id)
     }
 }
 

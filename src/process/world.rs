@@ -1,7 +1,7 @@
 //! The world process.
 
 use super::attach::{Readiness, Reception};
-use super::house::House;
+use super::membership::Membership;
 use super::observe::{self, ObservedSteps};
 use super::outcome::{Events, History, Outcome, StepMeter};
 use super::pace::Pacer;
@@ -158,7 +158,7 @@ pub fn run_world(
     }
     space.forget_world();
     space.check_room()?;
-    // The desk last: once it exists, everything else does.
+    // The service of members last: once it exists, everything else does.
     let services = create(&space, &options.run, stop, || {
         Services::create(&space, scenario, (coordinators, controllers), ledger.is_some())
     })?;
@@ -185,7 +185,7 @@ pub fn run_world(
     };
     let bells = space.create_bells()?;
     let ports = services.world_ports(&bells, scenario, wait)?;
-    let mut members = services.members_desk(run_id)?;
+    let mut members = services.members_outbox(run_id)?;
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
     let bell = rung.then(|| bells.bell(Role::World, 0));
@@ -217,7 +217,7 @@ pub fn run_world(
         driver.seat(role, index, Seat::new(0, process_id));
     }
     members.tell(first_step, driver.members())?;
-    let mut house = House {
+    let mut membership = Membership {
         reception,
         members,
         replace: options.replace,
@@ -229,7 +229,7 @@ pub fn run_world(
         arrived: Vec::new(),
     };
     if options.begins_paused && options.is_steered {
-        house.pacer.steer(Steering::Pause, first_step);
+        membership.pacer.steer(Steering::Pause, first_step);
     }
     let mut history = History::default();
     // Declared last, so let go first.
@@ -239,17 +239,17 @@ pub fn run_world(
     loop {
         let publishes = driver.is_between_steps();
         if publishes {
-            house.begin_step(&mut driver, &mut waiter, stop)?;
-            meter.begin_step(house.pacer.is_scheduled());
+            membership.begin_step(&mut driver, &mut waiter, stop)?;
+            meter.begin_step(membership.pacer.is_scheduled());
         }
         match driver.advance().map_err(|error| waiter.explain(error))? {
             Progress::Finished => {
                 // Nobody else waits for them any more.
                 waiter.wake(u64::MAX);
-                history.punctuality = house.pacer.report(&driver.names());
+                history.punctuality = membership.pacer.report(&driver.names());
                 history.refused = driver.refused();
                 history.late_frames = driver.late_frames();
-                history.events = house.events.take();
+                history.events = membership.events.take();
                 let outcome = meter.outcome(driver.world(), history);
                 let patience = options.peer_timeout;
                 let departure = Departure { driver, patience, _services: services, _space: space };
@@ -257,13 +257,13 @@ pub fn run_world(
             }
             Progress::Waiting(awaited) => {
                 trace::enter(Phase::Wait);
-                house.wait(&mut driver, &mut waiter, awaited)?;
+                membership.wait(&mut driver, &mut waiter, awaited)?;
             }
             Progress::Behind => unreachable!("the world is where the run is"),
             Progress::Advanced => waiter.reset(),
         }
         if publishes {
-            house.overlap_views(&mut driver)?;
+            membership.overlap_views(&mut driver)?;
         }
         if driver.world().step() == step {
             continue;
@@ -271,16 +271,16 @@ pub fn run_world(
         step = driver.world().step();
         trace::begin(Phase::Compute, step);
         waiter.reset();
-        house.overdue = None;
+        membership.overdue = None;
         let ns = meter.step_done(driver.was_event());
-        if let Some(viewing) = &mut house.viewing {
+        if let Some(viewing) = &mut membership.viewing {
             viewing.step_done(step - 1, ns);
         }
-        history.replacements.extend(house.step_done(&driver, ns));
-        if house.pacer.is_scheduled() || step.is_multiple_of(STEPS_PER_LOOK) {
+        history.replacements.extend(membership.step_done(&driver, ns));
+        if membership.pacer.is_scheduled() || step.is_multiple_of(STEPS_PER_LOOK) {
             progress(driver.world());
-            house.attend(&mut driver, &mut waiter)?;
-            house.attend_views(&mut driver)?;
+            membership.attend(&mut driver, &mut waiter)?;
+            membership.attend_views(&mut driver)?;
             if stop.is_set() {
                 return Err(ProcessError::Interrupted { step: Some(step) });
             }

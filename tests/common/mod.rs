@@ -57,25 +57,25 @@ pub fn unique_name(tag: &str) -> String {
 
 /// A runtime directory of its own, and the name of a run in it.
 #[derive(Debug)]
-pub struct Site {
+pub struct TestRun {
     runtime: TempDir,
     logs: TempDir,
     run: String,
 }
 
-impl Site {
-    pub fn new(tag: &str) -> Site {
+impl TestRun {
+    pub fn new(tag: &str) -> TestRun {
         // Short, because paths of sockets must be.
         let directory = || tempfile::Builder::new().prefix("cz").tempdir().unwrap();
-        Site { runtime: directory(), logs: directory(), run: unique_name(tag) }
+        TestRun { runtime: directory(), logs: directory(), run: unique_name(tag) }
     }
 
     /// The run's name.
-    pub fn run(&self) -> &str {
+    pub fn name(&self) -> &str {
         &self.run
     }
 
-    /// One of the four programs, in this site.
+    /// One of the four programs, in this run's directories.
     pub fn command(&self, program: &str) -> Command {
         let path = match program {
             "cz" => env!("CARGO_BIN_EXE_cz"),
@@ -90,7 +90,7 @@ impl Site {
         command
     }
 
-    /// Starts a program that takes part in the site's run.
+    /// Starts a program that takes part in the run.
     pub fn start(&self, program: &str, arguments: &[&str]) -> Process {
         self.start_in(program, &self.run, arguments)
     }
@@ -112,12 +112,12 @@ impl Site {
         self.start("cz", &all).ended().json()
     }
 
-    /// The directory of all runs of the site.
+    /// The directory of all runs beside it.
     pub fn runs(&self) -> PathBuf {
         self.runtime.path().join("cz")
     }
 
-    /// Files of the site's run, in the runtime directory and in shared memory.
+    /// Files of the run, in the runtime directory and in shared memory.
     pub fn files(&self) -> Vec<PathBuf> {
         files(Some(self.runtime.path()), &self.run)
     }
@@ -364,8 +364,8 @@ pub fn children(process_id: u32) -> Vec<(u32, Vec<String>)> {
 }
 
 /// Starts `cz run` and waits until it has started that many parts; returns their names and process ids.
-pub fn begin(site: &Site, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
-    let supervisor = site.start("cz", arguments);
+pub fn begin(test_run: &TestRun, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
+    let supervisor = test_run.start("cz", arguments);
     let mut parts = Vec::new();
     wait_until("the supervisor to have started the parts", || {
         // Between fork and exec a child has the command line of its parent.

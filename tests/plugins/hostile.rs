@@ -1,6 +1,6 @@
 //! Controllers that break the contract, are slow, or are killed.
 
-use crate::common::{self, Site, hash, wait_until};
+use crate::common::{self, TestRun, hash, wait_until};
 use crate::{cz, rust};
 use rustix::process::{Pid, Signal, kill_process};
 use std::time::Duration;
@@ -41,11 +41,11 @@ fn controllers_that_break_the_contract_are_named_and_leave_nothing_behind() {
     let mut wrong = String::new();
     for (mode, words, goes_on) in HOSTILE {
         for shield in ["off", "on"] {
-            let site = Site::new("hostile");
+            let test_run = TestRun::new("hostile");
             let controller = format!("merge-2=exec {command} {mode}");
             // Whoever brakes for ever must not drive for ever.
             let more = ["--shield", shield, "--peer-timeout", "3", "--set", "end.time_s=60"];
-            let ended = site.start("cz", &[&["--controller", &controller], &more[..]].concat()).ended();
+            let ended = test_run.start("cz", &[&["--controller", &controller], &more[..]].concat()).ended();
             let is_done = ended.status.code() == Some(0);
             let is_named = is_done || ended.err.contains(words);
             // What others are called must not be what the user's own is called.
@@ -53,7 +53,7 @@ fn controllers_that_break_the_contract_are_named_and_leave_nothing_behind() {
             if is_done != (goes_on && shield == "on") || !is_named || !is_clear {
                 wrong.push_str(&format!("{mode}, shield {shield}: {ended:?}\n"));
             }
-            site.assert_clean();
+            test_run.assert_clean();
         }
     }
     assert!(wrong.is_empty(), "{wrong}");
@@ -69,7 +69,7 @@ fn disturbed(policy: &str, seed: u64) -> String {
         state ^= state << 17;
         state % limit
     };
-    let site = Site::new("random");
+    let test_run = TestRun::new("random");
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("run.czlog");
     let command = rust("pauses");
@@ -77,7 +77,7 @@ fn disturbed(policy: &str, seed: u64) -> String {
     let conduct = ["--deadline", "0.02", "--on-miss", policy, "--shield", "on", "--json", "-"];
     let length = ["--set", "end.time_s=250", "--record", file.to_str().unwrap()];
     let all = [&["--controller", controller.as_str()], &conduct[..], &length].concat();
-    let supervisor = site.start("cz", &all);
+    let supervisor = test_run.start("cz", &all);
     let mut id = None;
     wait_until("the controller", || {
         // The supervisor's child is the keeper, and the controller is the keeper's.
@@ -102,7 +102,7 @@ fn disturbed(policy: &str, seed: u64) -> String {
     }
     let ended = supervisor.ended();
     assert!(!ended.err.contains("panicked"), "{policy}, {seed}: {ended:?}");
-    site.assert_clean();
+    test_run.assert_clean();
     let replay = cz().arg("replay").arg(&file).arg("--json").output().unwrap();
     let replayed = String::from_utf8(replay.stdout).unwrap();
     let came_to = if ended.status.success() {

@@ -1,6 +1,6 @@
 //! What the packages promise their users, in every language.
 
-use crate::common::{Ended, Site, hash};
+use crate::common::{Ended, TestRun, hash};
 use crate::{compiled, cz, installed, python, root, rust};
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::load;
@@ -22,11 +22,11 @@ fn in_every_language(folder: &Path) -> Vec<(&'static str, String)> {
     all
 }
 
-/// Runs zone 2 with that controller; the site's summary and what was said on stderr.
-fn driven(site: &Site, command: &str, arguments: &[&str]) -> (Value, Ended) {
+/// Runs zone 2 with that controller; the run's summary and what was said on stderr.
+fn driven(test_run: &TestRun, command: &str, arguments: &[&str]) -> (Value, Ended) {
     let controller = format!("merge-2={command}");
     let all = [&["--json", "-", "--controller", &controller], arguments].concat();
-    let ended = site.start("cz", &all).ended_within(Duration::from_secs(240));
+    let ended = test_run.start("cz", &all).ended_within(Duration::from_secs(240));
     (ended.json(), ended)
 }
 
@@ -60,14 +60,14 @@ fn a_controller_that_pauses_for_a_minute_catches_up_in_every_language() {
 }
 
 fn pauses_and_catches_up(language: &str, command: &str, policy: &str, arguments: &[&str]) {
-    let site = Site::new("pause");
+    let test_run = TestRun::new("pause");
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("run.czlog");
     let record = file.to_str().unwrap();
     let conduct = ["--deadline", "0.02", "--on-miss", policy, "--shield", "on", "--record", record];
     // What should fit together is worked out for the order of entry.
     let arguments = [&["--set", "coordination.order=fifo"], arguments].concat();
-    let (summary, ended) = driven(&site, command, &[&conduct[..], &arguments].concat());
+    let (summary, ended) = driven(&test_run, command, &[&conduct[..], &arguments].concat());
     let [answered, skipped, wrong] = counts(&ended);
     let steps = summary["steps"].as_u64().unwrap();
     let missed = summary["punctuality"]["missed_steps"].as_u64().unwrap();
@@ -81,7 +81,7 @@ fn pauses_and_catches_up(language: &str, command: &str, policy: &str, arguments:
     assert_eq!(wrong, 0, "{language}, {policy}: it was shown what does not fit together");
     let replay = cz().args(["replay", record, "--json"]).output().unwrap();
     assert!(replay.status.success(), "{language}, {policy}: {replay:?}");
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
@@ -279,10 +279,10 @@ fn documented_controllers_run_as_printed_within_limits_and_without_a_shield() {
     }
     let mut hashes = Vec::new();
     for (file, command) in all {
-        let site = Site::new("printed");
-        let (summary, _) = driven(&site, &command, &["--shield", "off"]);
+        let test_run = TestRun::new("printed");
+        let (summary, _) = driven(&test_run, &command, &["--shield", "off"]);
         hashes.push((file, hash(&summary)));
-        site.assert_clean();
+        test_run.assert_clean();
     }
     // All of them hold 15 m/s.
     assert!(hashes.iter().all(|(_, hash)| *hash == hashes[0].1), "{hashes:?}");
@@ -296,12 +296,12 @@ fn python_arrays_are_read_only_may_be_kept_and_mistakes_are_explained() {
         let path = folder.path().join("law.py");
         let code = format!("import control_zones\nkept = []\n{law}\ncontrol_zones.run(law)\n");
         std::fs::write(&path, code).unwrap();
-        let site = Site::new("arrays");
+        let test_run = TestRun::new("arrays");
         let controller = format!("merge-2={python} {}", path.display());
-        let ended = site
+        let ended = test_run
             .start("cz", &["--controller", &controller, "--set", "end.time_s=60", "--shield", "on"])
             .ended();
-        site.assert_clean();
+        test_run.assert_clean();
         ended
     };
     // Each of these ended the controller with a signal, or changed what it saw, or the next would have seen.

@@ -1,6 +1,6 @@
 //! What the commands say of a recording.
 
-use super::common::Site;
+use super::common::TestRun;
 use super::*;
 use std::os::unix::fs::PermissionsExt;
 
@@ -20,7 +20,7 @@ fn a_recording_of_another_version_is_refused_by_all_who_read_it() {
             &["resume", name],
             &["branch", name, "--at", "5", "--set", "objective.beta=1.0"],
         ] {
-            let output = Site::new("old").command("cz").args(arguments).output().unwrap();
+            let output = TestRun::new("old").command("cz").args(arguments).output().unwrap();
             let said = String::from_utf8(output.stderr).unwrap();
             let expected = format!(
                 "cz: {name}: the recording has format version {version}, this program reads version 3\n"
@@ -32,11 +32,11 @@ fn a_recording_of_another_version_is_refused_by_all_who_read_it() {
 
 #[test]
 fn the_commands_tell_what_is_in_a_file() {
-    let site = Site::new("rec");
+    let test_run = TestRun::new("rec");
     let directory = tempfile::tempdir().unwrap();
     let path = |name: &str| directory.path().join(name).to_str().unwrap().to_owned();
     let cz = |arguments: &[&str]| {
-        let output = site.command("cz").args(arguments).output().unwrap();
+        let output = test_run.command("cz").args(arguments).output().unwrap();
         let text = |bytes| String::from_utf8(bytes).unwrap();
         (output.status.code().unwrap(), text(output.stdout), text(output.stderr))
     };
@@ -136,7 +136,7 @@ fn with_metadata(run: &Run, change: impl FnOnce(&mut Metadata)) -> Vec<u8> {
 
 #[test]
 fn a_recording_of_another_build_is_read_and_named() {
-    let (site, directory) = (Site::new("build"), tempfile::tempdir().unwrap());
+    let (test_run, directory) = (TestRun::new("build"), tempfile::tempdir().unwrap());
     let file = directory.path().join("other.czlog");
     let name = file.to_str().unwrap();
     let other = with_metadata(&small(), |metadata| {
@@ -145,14 +145,14 @@ fn a_recording_of_another_build_is_read_and_named() {
     });
     std::fs::write(&file, other).unwrap();
     for arguments in [&["show", name][..], &["verify", name, name], &["replay", name]] {
-        let output = site.command("cz").args(arguments).output().unwrap();
+        let output = test_run.command("cz").args(arguments).output().unwrap();
         let said = String::from_utf8(output.stderr).unwrap();
         assert!(output.status.success(), "{said}");
         assert!(said.contains("written by control-zones 0.0.9 (commit 0123456789ab"), "{said}");
         assert!(said.contains(&format!("this is control-zones {}", env!("CARGO_PKG_VERSION"))), "{said}");
     }
     std::fs::write(&file, small().bytes).unwrap();
-    let output = site.command("cz").args(["show", name]).output().unwrap();
+    let output = test_run.command("cz").args(["show", name]).output().unwrap();
     assert!(output.stderr.is_empty(), "{output:?}");
 }
 

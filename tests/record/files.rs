@@ -1,6 +1,6 @@
 //! The file of a recording: when it comes to be, what it replaces, and what is said when it cannot be written.
 
-use super::common::{self, LONG_RUN, Site, begin, is_alive, part, wait_until};
+use super::common::{self, LONG_RUN, TestRun, begin, is_alive, part, wait_until};
 use super::*;
 use control_zones::record::{RecordError, Recorder};
 use control_zones::scenario::{Arrival, Demand};
@@ -8,8 +8,8 @@ use rustix::process::Signal;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-fn cz(site: &Site, arguments: &[&str]) -> Output {
-    site.command("cz").args(arguments).output().unwrap()
+fn cz(test_run: &TestRun, arguments: &[&str]) -> Output {
+    test_run.command("cz").args(arguments).output().unwrap()
 }
 
 fn said(output: &Output) -> String {
@@ -36,37 +36,37 @@ const SHORT: [&str; 3] = ["run", "--set", "end.time_s=20"];
 
 #[test]
 fn a_run_that_does_not_begin_leaves_an_older_recording_as_it_was() {
-    let (site, (directory, file, name)) = (Site::new("old"), place());
-    let output = cz(&site, &[&SHORT[..], &["--in-process", "--record", &name]].concat());
+    let (test_run, (directory, file, name)) = (TestRun::new("old"), place());
+    let output = cz(&test_run, &[&SHORT[..], &["--in-process", "--record", &name]].concat());
     assert!(output.status.success(), "{output:?}");
     let before = std::fs::read(&file).unwrap();
     let mistyped = ["--controller", "merge-2=no-such-program", "--record", &name, "--attach-timeout", "10"];
-    let output = cz(&site, &[&SHORT[..], &mistyped].concat());
+    let output = cz(&test_run, &[&SHORT[..], &mistyped].concat());
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(said(&output).contains("recorded nothing"), "{output:?}");
     // A name that is taken.
-    let world = site.start("cz-world", &[]);
-    site.wait_until_settled();
-    let output = cz(&site, &[&SHORT[..], &["--run", site.run(), "--record", &name]].concat());
+    let world = test_run.start("cz-world", &[]);
+    test_run.wait_until_settled();
+    let output = cz(&test_run, &[&SHORT[..], &["--run", test_run.name(), "--record", &name]].concat());
     assert!(said(&output).contains("is active already"), "{output:?}");
     world.signal(Signal::TERM);
     world.ended();
     assert!(std::fs::read(&file).unwrap() == before, "the old recording has been replaced");
     assert_eq!(entries(directory.path()), 1);
-    site.assert_clean();
+    test_run.assert_clean();
 }
 
 #[test]
 fn a_recording_that_grows_is_neither_recorded_into_nor_resumed() {
-    let (site, (directory, file, name)) = (Site::new("two"), place());
-    let (supervisor, _) = begin(&site, &[&LONG_RUN[..], &["--record", &name]].concat(), 3);
+    let (test_run, (directory, file, name)) = (TestRun::new("two"), place());
+    let (supervisor, _) = begin(&test_run, &[&LONG_RUN[..], &["--record", &name]].concat(), 3);
     wait_until("the recording to grow", || steps_in(&file) > 100);
     for arguments in [&["run", "--in-process", "--record", &name][..], &["run", "--record", &name]] {
-        let output = cz(&site, arguments);
+        let output = cz(&test_run, arguments);
         assert_eq!(output.status.code(), Some(2), "{output:?}");
         assert!(said(&output).contains("another run is recording into"), "{output:?}");
     }
-    let output = cz(&site, &["resume", &name]);
+    let output = cz(&test_run, &["resume", &name]);
     assert_eq!(output.status.code(), Some(2), "{output:?}");
     assert!(said(&output).contains("still recording into it"), "{output:?}");
     supervisor.signal(Signal::INT);
@@ -76,8 +76,8 @@ fn a_recording_that_grows_is_neither_recorded_into_nor_resumed() {
 
 #[test]
 fn a_recording_that_is_taken_away_is_an_error_that_does_not_cost_the_results() {
-    let (site, (directory, file, name)) = (Site::new("gone"), place());
-    let (supervisor, _) = begin(&site, &[&LONG_RUN[..], &["--json", "-", "--record", &name]].concat(), 3);
+    let (test_run, (directory, file, name)) = (TestRun::new("gone"), place());
+    let (supervisor, _) = begin(&test_run, &[&LONG_RUN[..], &["--json", "-", "--record", &name]].concat(), 3);
     wait_until("the recording to grow", || steps_in(&file) > 100);
     std::fs::remove_dir_all(directory.path()).unwrap();
     let ended = supervisor.ended();
@@ -88,10 +88,10 @@ fn a_recording_that_is_taken_away_is_an_error_that_does_not_cost_the_results() {
 
 #[test]
 fn a_recorder_that_falls_behind_holds_a_run_without_deadline_back() {
-    let (site, (_directory, file, name)) = (Site::new("lag"), place());
-    let expected = common::hash(&site.summary(&[&LONG_RUN[..], &["--in-process"]].concat()));
+    let (test_run, (_directory, file, name)) = (TestRun::new("lag"), place());
+    let expected = common::hash(&test_run.summary(&[&LONG_RUN[..], &["--in-process"]].concat()));
     let arguments = [&LONG_RUN[..], &["--json", "-", "--peer-timeout", "50", "--record", &name]].concat();
-    let (supervisor, parts) = begin(&site, &arguments, 3);
+    let (supervisor, parts) = begin(&test_run, &arguments, 3);
     wait_until("the recording to grow", || steps_in(&file) > 100);
     supervisor.signal(Signal::STOP);
     // Long enough for more steps than may wait.
@@ -106,9 +106,9 @@ fn a_recorder_that_falls_behind_holds_a_run_without_deadline_back() {
 
 #[test]
 fn a_run_with_a_deadline_leaves_out_what_cannot_be_recorded_in_time() {
-    let (site, (_directory, file, name)) = (Site::new("drop"), place());
+    let (test_run, (_directory, file, name)) = (TestRun::new("drop"), place());
     let arguments = [&LONG_RUN[..], &["--deadline", "10", "--record", &name]].concat();
-    let (supervisor, parts) = begin(&site, &arguments, 3);
+    let (supervisor, parts) = begin(&test_run, &arguments, 3);
     wait_until("the recording to grow", || steps_in(&file) > 100);
     supervisor.signal(Signal::STOP);
     wait_until("the run to be over", || !is_alive(part(&parts, "world")));
@@ -120,9 +120,9 @@ fn a_run_with_a_deadline_leaves_out_what_cannot_be_recorded_in_time() {
 
 #[test]
 fn a_recorder_that_takes_nothing_for_too_long_is_named() {
-    let (site, (_directory, file, name)) = (Site::new("held"), place());
+    let (test_run, (_directory, file, name)) = (TestRun::new("held"), place());
     let arguments = [&LONG_RUN[..], &["--peer-timeout", "2", "--record", &name]].concat();
-    let (supervisor, parts) = begin(&site, &arguments, 3);
+    let (supervisor, parts) = begin(&test_run, &arguments, 3);
     wait_until("the recording to grow", || steps_in(&file) > 100);
     supervisor.signal(Signal::STOP);
     wait_until("the world to give up", || !is_alive(part(&parts, "world")));
@@ -132,25 +132,25 @@ fn a_recorder_that_takes_nothing_for_too_long_is_named() {
         .expect(1, &["whoever records the run has taken no step for 1.8 s", "--record-lag drop"]);
     // What was taken can be gone on from.
     assert_eq!(Reader::open(&file).unwrap().gaps(), []);
-    assert!(cz(&site, &["resume", &name]).status.success());
+    assert!(cz(&test_run, &["resume", &name]).status.success());
 }
 
 /// Runs `cz` under a limit of so many blocks per file.
-fn limited(site: &Site, blocks: u32, arguments: &str) -> Output {
-    let cz = site.command("cz").get_program().to_str().unwrap().to_owned();
+fn limited(test_run: &TestRun, blocks: u32, arguments: &str) -> Output {
+    let cz = test_run.command("cz").get_program().to_str().unwrap().to_owned();
     let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec '{cz}' {arguments}");
     std::process::Command::new("sh").args(["-c", &script]).output().unwrap()
 }
 
 #[test]
 fn a_full_disk_is_known_at_the_start_or_at_once_and_costs_no_results() {
-    let (site, (directory, file, name)) = (Site::new("full"), place());
+    let (test_run, (directory, file, name)) = (TestRun::new("full"), place());
     let run = format!("run --in-process --record {name}");
-    let output = limited(&site, 0, &run);
+    let output = limited(&test_run, 0, &run);
     assert_eq!((output.status.code(), output.stdout.len()), (Some(2), 0), "{output:?}");
     assert!(said(&output).contains("--record: cannot create"), "{output:?}");
     assert_eq!(entries(directory.path()), 0);
-    let output = limited(&site, 400, &run);
+    let output = limited(&test_run, 400, &run);
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(said(&output).contains("; the run goes on without being recorded\n"), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("total"), "{output:?}");
@@ -160,16 +160,17 @@ fn a_full_disk_is_known_at_the_start_or_at_once_and_costs_no_results() {
 
 #[test]
 fn a_file_for_the_summary_that_cannot_be_written_costs_no_results() {
-    let (site, (directory, file, name)) = (Site::new("json"), place());
+    let (test_run, (directory, file, name)) = (TestRun::new("json"), place());
     let missing = directory.path().join("no").join("such.json");
-    let output = cz(&site, &[&SHORT[..], &["--in-process", "--json", missing.to_str().unwrap()]].concat());
+    let output =
+        cz(&test_run, &[&SHORT[..], &["--in-process", "--json", missing.to_str().unwrap()]].concat());
     assert_eq!((output.status.code(), output.stdout.len()), (Some(2), 0), "{output:?}");
-    let output = cz(&site, &[&SHORT[..], &["--in-process", "--json", "/dev/full"]].concat());
+    let output = cz(&test_run, &[&SHORT[..], &["--in-process", "--json", "/dev/full"]].concat());
     assert_eq!(output.status.code(), Some(1), "{output:?}");
     assert!(String::from_utf8_lossy(&output.stdout).contains("total"), "{output:?}");
     assert!(said(&output).contains("cannot write /dev/full"), "{output:?}");
     // A run that is refused leaves no empty file.
-    let output = cz(&site, &["run", "--in-process", "--record", "/dev/null", "--json", &name]);
+    let output = cz(&test_run, &["run", "--in-process", "--record", "/dev/null", "--json", &name]);
     assert!(output.status.code() == Some(2) && !file.exists(), "{output:?}");
 }
 

@@ -72,17 +72,17 @@ pub(super) fn conduct(
     let mut recording = recording;
     let mut watch = || {
         claim(&plan.run)?;
-        let mut family = Family::new(plan, recording.is_some())?;
+        let mut children = Children::new(plan, recording.is_some())?;
         observation = recording.take().map(|recording| {
             Observation::start(plan.run.clone(), recording, |r: &mut Recording, step, b| {
                 r.push_block(step, b)
             })
         });
-        let outcome = family.watch(|position| bar.iter().for_each(|bar| bar.show(position)));
-        Ok((family, outcome))
+        let outcome = children.watch(|position| bar.iter().for_each(|bar| bar.show(position)));
+        Ok((children, outcome))
     };
-    let (family, outcome) = match watch() {
-        Ok((family, outcome)) => (Some(family), outcome),
+    let (children, outcome) = match watch() {
+        Ok((children, outcome)) => (Some(children), outcome),
         Err(error) => (None, Err(error)),
     };
     bar.iter().for_each(|bar| bar.finish());
@@ -104,8 +104,8 @@ pub(super) fn conduct(
     };
     let recorded = record::finish(recording, path.as_deref(), &outcome);
     let mut traced = Ok(());
-    if let Some(family) = family {
-        family.close();
+    if let Some(children) = children {
+        children.close();
         traced = plan.trace.map_or(Ok(()), put_together);
         // Whoever is still alive in the space keeps it; then there is nothing to be swept.
         let _ = RunSpace::sweep(&plan.run);
@@ -169,7 +169,7 @@ struct Recipe {
 }
 
 /// The processes of a run.
-struct Family {
+struct Children {
     life: Life,
     recipes: Vec<Recipe>,
     events: Sender<Event>,
@@ -182,8 +182,8 @@ struct Family {
     refused: Vec<RefusedFrames>,
 }
 
-impl Family {
-    fn new(plan: &Plan<'_>, observed: bool) -> Result<Family, AppError> {
+impl Children {
+    fn new(plan: &Plan<'_>, observed: bool) -> Result<Children, AppError> {
         let failed = |what: &str, why: &dyn std::fmt::Display| AppError::Failed(format!("{what}: {why}"));
         let (signal_sender, signals) = unbounded();
         let mut source = signal_hook::iterator::Signals::new(signals_to_heed())
@@ -202,7 +202,7 @@ impl Family {
         let _ = set_child_subreaper(Some(getpid()));
         let (events, inbox) = bounded(WAITING);
         let replaces = plan.conduct.restart == Restart::OnFailure;
-        let mut family = Family {
+        let mut children = Children {
             life: Life::new(replaces, plan.conduct.wait.peer_timeout),
             recipes: Vec::new(),
             events,
@@ -213,8 +213,8 @@ impl Family {
             outcome: None,
             refused: Vec::new(),
         };
-        family.cast(plan, observed);
-        Ok(family)
+        children.cast(plan, observed);
+        Ok(children)
     }
 
     /// Says who takes part.
@@ -367,7 +367,7 @@ impl Family {
                 let now = self.time.look(2 * LOOK);
                 self.life.interrupted(name, now);
             }
-            recv(self.inbox) -> event => self.take(event.expect("the family holds a sender"), progress),
+            recv(self.inbox) -> event => self.take(event.expect("the supervisor holds a sender"), progress),
             default(patience) => {}
         }
     }

@@ -12,7 +12,7 @@ mod rules;
 pub use rules::{Breach, Report, Rule};
 
 use super::attach::{Readiness, Reception};
-use super::services::MembersDesk;
+use super::services::MembersOutbox;
 use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
@@ -73,7 +73,7 @@ pub fn check(
     let state = space.create(frames::SERVICE_STATE, limits(1, 3))?;
     let coordination = space.create(frames::SERVICE_COORDINATION, limits(1, 3))?;
     let commands = space.create(frames::SERVICE_COMMAND, limits(3, 1))?;
-    let members = space.create(frames::SERVICE_MEMBERS, MembersDesk::limits(3, 6))?;
+    let members = space.create(frames::SERVICE_MEMBERS, MembersOutbox::limits(3, 6))?;
     let run_id = 0x636f_6e66_6f72_6d00 | u64::from(std::process::id() & 0xff);
     let mut world = World::new(scenario.clone(), 1);
     world.share_out(INDEX + 1);
@@ -83,7 +83,7 @@ pub fn check(
         state: state.outbox(256)?,
         coordination: coordination.outbox(512)?,
         commands: commands.inbox()?,
-        members: MembersDesk::open(&members, run_id)?,
+        members: MembersOutbox::open(&members, run_id)?,
         coordinator: Coordinator::new(scenario.clone(), zones.clone()),
         in_force: zones.clone().map(|_| Vec::new()).collect(),
         pool: ControllerPool::new(scenario.clone(), zones),
@@ -120,7 +120,7 @@ struct Kit<'a> {
     state: IoxOutbox<VehicleState>,
     coordination: IoxOutbox<Assignment>,
     commands: IoxInbox<VehicleCommand>,
-    members: MembersDesk,
+    members: MembersOutbox,
     coordinator: Coordinator,
     /// By zone.
     in_force: Vec<Vec<Assignment>>,

@@ -16,4 +16,4 @@ pub use error::SpaceError;
 pub use leftovers::{Condition, Leftover, clean, sweep_dead_runs};
 pub use name::{RunName, RunNameError};
 pub use ports::{IoxFrame, IoxInbox, IoxLoan, IoxOutbox};
-pub use space::{AttachDesk, AttachLine, ReplyFrame, RunSpace, Service, ServiceLimits};
+pub use space::{AttachLine, AttachServer, ReplyFrame, RunSpace, Service, ServiceLimits};

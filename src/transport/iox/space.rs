@@ -208,11 +208,11 @@ impl RunSpace {
     }
 
     /// Opens the world's side of attaching.
-    pub fn create_attach_desk(
+    pub fn create_attach_server(
         &self,
         participants: usize,
         reply_bytes: usize,
-    ) -> Result<AttachDesk, SpaceError> {
+    ) -> Result<AttachServer, SpaceError> {
         // Refused participants take slots too, until they leave.
         let slots = participants + 8;
         let requests = self
@@ -236,7 +236,7 @@ impl RunSpace {
             .max_nodes(slots + 1)
             .create()
             .map_err(|e| create_error(SERVICE_ATTACH_REPLY, e))?;
-        Ok(AttachDesk {
+        Ok(AttachServer {
             requests: requests
                 .subscriber_builder()
                 .create()
@@ -397,12 +397,12 @@ fn open_error(name: &str, error: PublishSubscribeOpenError) -> SpaceError {
 
 /// The world's side of attaching.
 #[derive(Debug)]
-pub struct AttachDesk {
+pub struct AttachServer {
     requests: Subscriber<ipc::Service, AttachRequest, ()>,
     replies: Publisher<ipc::Service, [u8], AttachReply>,
 }
 
-impl AttachDesk {
+impl AttachServer {
     /// The next request, if there is one.
     pub fn next_request(&self) -> Result<Option<AttachRequest>, TransportError> {
         match self.requests.receive() {

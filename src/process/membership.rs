@@ -3,7 +3,7 @@
 use super::attach::{Readiness, Reception};
 use super::outcome::Events;
 use super::pace::Pacer;
-use super::services::{Driver, MembersDesk};
+use super::services::{Driver, MembersOutbox};
 use super::viewing::Viewing;
 use super::{OnMiss, Peer, Peers, ProcessError, Replacement, StopFlag, Waiter};
 use crate::lockstep::Awaited;
@@ -23,9 +23,9 @@ const ATTEND_AFTER: Duration = Duration::from_millis(1);
 
 /// Who is in the run, and who comes and goes.
 #[derive(Debug)]
-pub(super) struct House {
+pub(super) struct Membership {
     pub reception: Reception,
-    pub members: MembersDesk,
+    pub members: MembersOutbox,
     pub replace: bool,
     pub pacer: Pacer,
     /// There is one when the run may be looked at.
@@ -40,7 +40,7 @@ pub(super) struct House {
     pub arrived: Vec<(Peer, u32)>,
 }
 
-impl House {
+impl Membership {
     /// Waits until the present step is due.
     pub(super) fn begin_step(
         &mut self,
@@ -138,13 +138,13 @@ impl House {
 
     /// Sees to whoever looks; between two steps.
     pub(super) fn attend_views(&mut self, driver: &mut Driver) -> Result<(), ProcessError> {
-        let House { viewing, pacer, events, .. } = self;
+        let Membership { viewing, pacer, events, .. } = self;
         viewing.as_mut().map_or(Ok(()), |viewing| viewing.attend(driver, pacer, events))
     }
 
     /// Sees to whoever has come.
     pub(super) fn attend(&mut self, driver: &mut Driver, waiter: &mut Waiter) -> Result<(), ProcessError> {
-        let House { reception, members, arrived, gone, .. } = self;
+        let Membership { reception, members, arrived, gone, .. } = self;
         reception.go_on_from(driver.world().step());
         let before = arrived.len();
         let step = driver.world().step();
