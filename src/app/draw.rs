@@ -89,7 +89,7 @@ impl Picture {
     }
 
     fn bounds(&self) -> (Place, Place) {
-        let places = || self.lanes.iter().flat_map(|(shape, _)| shape);
+        let places = || self.lanes.iter().map(|(shape, _)| shape).chain(&self.links).flatten();
         let least = |of: fn(&Place) -> f64| places().map(of).fold(f64::INFINITY, f64::min);
         let most = |of: fn(&Place) -> f64| places().map(of).fold(f64::NEG_INFINITY, f64::max);
         ((least(|p| p.0), least(|p| p.1)), (most(|p| p.0), most(|p| p.1)))
@@ -113,50 +113,62 @@ impl Picture {
         let margin = MARGIN_PX as i32;
         let whole =
             View::new((low, high), (margin, margin), (width as i32 - 2 * margin, height as i32 - 2 * margin));
-        self.draw_view(&area, &whole, false)?;
         // Where conflicts are close together they are shown again, enlarged, in an empty corner.
         let (near, far) = self.points.iter().fold((high, low), |(near, far), (p, ..)| {
             ((near.0.min(p.0), near.1.min(p.1)), (far.0.max(p.0), far.1.max(p.1)))
         });
         let extent = (far.0 - near.0).max(far.1 - near.1);
-        if extent > 0.0 && extent < 0.2 * (high.0 - low.0).min(high.1 - low.1) {
+        let is_crowded = extent > 0.0 && extent < 0.2 * (high.0 - low.0).min(high.1 - low.1);
+        self.draw_view(&area, &whole, if is_crowded { Names::Entrances } else { Names::Places })?;
+        if is_crowded {
             let room = 0.35 * extent;
             let bounds = ((near.0 - room, near.1 - room), (far.0 + room, far.1 + room));
             let side = (0.42 * f64::from(width.min(height))) as i32;
             let place = (10, height as i32 - side - 10);
             area.draw(&Rectangle::new([place, (place.0 + side, place.1 + side)], WHITE.filled()))?;
             area.draw(&Rectangle::new([place, (place.0 + side, place.1 + side)], LANE.stroke_width(1)))?;
-            self.draw_view(&area, &View::new(bounds, place, (side, side)), true)?;
+            self.draw_view(&area, &View::new(bounds, place, (side, side)), Names::Points)?;
         }
-        let legend = [
-            ("entrance", ENTRANCE),
-            ("lane", LANE),
-            ("merge", MERGE),
-            ("crossing", CROSSING),
-            ("exit", EXIT),
-        ];
-        for (at, (name, color)) in (0..).zip(legend) {
-            let y = 16 + 18 * at;
-            area.draw(&Rectangle::new([(10, y - 4), (22, y + 4)], color.filled()))?;
-            let style = ("sans-serif", 14).into_font().color(&BLACK).pos(Pos::new(HPos::Left, VPos::Center));
-            area.draw(&Text::new(name, (28, y), style))?;
-        }
+        self.legend(&area, !is_crowded)?;
         area.present()
+    }
+
+    /// What colours mean, of those that are there, in a line above everything else.
+    fn legend<DB: DrawingBackend>(
+        &self,
+        area: &DrawingArea<DB, Shift>,
+        has_exits: bool,
+    ) -> Result<(), DrawingAreaErrorKind<DB::ErrorType>> {
+        let has_lane = |wanted: RGBColor| self.lanes.iter().any(|(_, color)| *color == wanted);
+        let has_point = |wanted: PointKind| self.points.iter().any(|(_, kind, _)| *kind == wanted);
+        let entries = [
+            ("entrance", ENTRANCE, has_lane(ENTRANCE)),
+            ("lane", LANE, has_lane(LANE)),
+            ("merge", MERGE, has_point(PointKind::Merge)),
+            ("crossing", CROSSING, has_point(PointKind::Crossing)),
+            ("exit", EXIT, has_exits),
+        ];
+        let mut x = 12;
+        for (name, color, _) in entries.iter().filter(|(.., is_there)| *is_there) {
+            area.draw(&Rectangle::new([(x, 10), (x + 12, 18)], color.filled()))?;
+            let style = ("sans-serif", 14).into_font().color(&BLACK).pos(Pos::new(HPos::Left, VPos::Center));
+            area.draw(&Text::new(*name, (x + 18, 14), style))?;
+            x += 18 + width_px(name) + 16;
+        }
+        Ok(())
     }
 
     fn draw_view<DB: DrawingBackend>(
         &self,
         area: &DrawingArea<DB, Shift>,
         view: &View,
-        is_inset: bool,
+        names: Names,
     ) -> Result<(), DrawingAreaErrorKind<DB::ErrorType>> {
-        let text = |place: (i32, i32), text: &str, color: RGBColor, size: u32| {
-            let style =
-                ("sans-serif", size).into_font().color(&color).pos(Pos::new(HPos::Center, VPos::Bottom));
-            area.draw(&Text::new(text.to_owned(), (place.0, place.1 - 6), style))
-        };
+        // What names keep clear of.
+        let mut drawn: Vec<(i32, i32)> = Vec::new();
         for piece in self.links.iter().flat_map(|link| link.windows(2)) {
             if let Some(line) = view.line(piece[0], piece[1]) {
+                drawn.extend(dotted(&line));
                 area.draw(&PathElement::new(line.to_vec(), LANE.mix(0.4).stroke_width(2)))?;
             }
         }
@@ -164,23 +176,114 @@ impl Picture {
             let lines: Vec<[(i32, i32); 2]> =
                 shape.windows(2).filter_map(|w| view.line(w[0], w[1])).collect();
             for line in &lines {
+                drawn.extend(dotted(line));
                 area.draw(&PathElement::new(line.to_vec(), color.stroke_width(3)))?;
             }
             if let Some(line) = lines.get(lines.len() / 2) {
                 area.draw(&Polygon::new(arrow(line), color.filled()))?;
             }
         }
+        let mut labels: Vec<(Place, &String, RGBColor)> = Vec::new();
         for (place, kind, name) in self.points.iter().filter(|(place, ..)| view.holds(*place)) {
             let color = if *kind == PointKind::Merge { MERGE } else { CROSSING };
             area.draw(&Circle::new(view.px(*place), 5, color.filled()))?;
-            if is_inset && self.points.len() <= 30 {
-                text(view.px(*place), name, color, 14)?;
+            let (x, y) = view.px(*place);
+            // Three rows of three: a point is worth more than a lane.
+            drawn.extend((0..9).map(|i| (x + 4 * (i % 3 - 1), y + 4 * (i / 3 - 1))));
+            if names == Names::Points && self.points.len() <= 30 {
+                labels.push((*place, name, color));
             }
         }
-        for (place, name, color) in self.labels.iter().filter(|_| !is_inset) {
-            text(view.px(*place), name, *color, 15)?;
+        let shown =
+            |color: RGBColor| names == Names::Places || names == Names::Entrances && color == ENTRANCE;
+        labels.extend(self.labels.iter().filter(|(.., c)| shown(*c)).map(|(p, name, c)| (*p, name, *c)));
+        let (width, height) = area.dim_in_pixel();
+        let mut taken: Vec<Label> = Vec::new();
+        for (place, name, color) in labels {
+            let label = Label::beside(view.px(place), name, (width as i32, height as i32), &taken, &drawn);
+            let style =
+                ("sans-serif", 14).into_font().color(&color).pos(Pos::new(HPos::Center, VPos::Center));
+            area.draw(&Text::new(name.clone(), (label.x, label.y), style))?;
+            taken.push(label);
         }
         Ok(())
+    }
+}
+
+/// What is named in a view.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Names {
+    /// Entrances, exits and zones.
+    Places,
+    /// Entrances; the rest is too close together.
+    Entrances,
+    /// Conflict points.
+    Points,
+}
+
+/// Width of a text of the pictures' size, about, pixels.
+fn width_px(text: &str) -> i32 {
+    text.chars().count() as i32 * 8
+}
+
+/// Places along a line, a few pixels from each other.
+fn dotted([(x0, y0), (x1, y1)]: &[(i32, i32); 2]) -> impl Iterator<Item = (i32, i32)> + use<> {
+    let (x0, y0, dx, dy) = (*x0, *y0, x1 - x0, y1 - y0);
+    let count = (dx.abs().max(dy.abs()) / 5).max(1);
+    (0..=count).map(move |i| (x0 + dx * i / count, y0 + dy * i / count))
+}
+
+/// A text with its middle there, pixels.
+struct Label {
+    x: i32,
+    y: i32,
+    half_width: i32,
+}
+
+/// Half the height of a line of text with what is left free around it, pixels.
+const HALF_LINE_PX: i32 = 9;
+
+impl Label {
+    /// A name beside a place: where the least is covered, above if that is as good.
+    fn beside(
+        (x, y): (i32, i32),
+        name: &str,
+        (width, height): (i32, i32),
+        taken: &[Label],
+        drawn: &[(i32, i32)],
+    ) -> Label {
+        let half_width = width_px(name) / 2 + 2;
+        let near = [1, 2, 3].into_iter().flat_map(|far| {
+            let (up, aside) = (14 * far, half_width + 8 * far);
+            [
+                (0, -up),
+                (0, up),
+                (aside, 0),
+                (-aside, 0),
+                (aside, -up),
+                (-aside, -up),
+                (aside, up),
+                (-aside, up),
+            ]
+            .map(|(dx, dy)| (x + dx, y + dy, far))
+        });
+        let inside = |(x, y, far): (i32, i32, i32)| {
+            let x = x.clamp(half_width + 2, (width - half_width - 2).max(half_width + 2));
+            (x, y.clamp(30 + HALF_LINE_PX, height - HALF_LINE_PX), far)
+        };
+        let cost = |&(x, y, far): &(i32, i32, i32)| {
+            let covers = |px: i32, py: i32, room: i32| {
+                (px - x).abs() < half_width + room && (py - y).abs() < HALF_LINE_PX
+            };
+            let lanes = drawn.iter().filter(|(px, py)| covers(*px, *py, 2)).count() as i32;
+            let overlaps = |other: &&Label| {
+                (other.x - x).abs() < half_width + other.half_width
+                    && (other.y - y).abs() < 2 * HALF_LINE_PX - 2
+            };
+            3 * lanes + 100 * taken.iter().filter(overlaps).count() as i32 + 2 * far
+        };
+        let best = near.map(inside).min_by_key(cost).unwrap_or((x, y, 0));
+        Label { x: best.0, y: best.1, half_width }
     }
 }
 
