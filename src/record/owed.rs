@@ -35,6 +35,9 @@ pub struct Owed {
     pub pair: Pair,
     /// The condition as the built-in law has it.
     pub condition: Condition,
+    /// Whether its margin counts now: toward a leader at any instant, toward others once the vehicle comes to the
+    /// conflict point within a step. Before that it is a distance that need not be there yet.
+    pub counts: bool,
 }
 
 /// A safety condition between two vehicles.
@@ -150,7 +153,10 @@ fn owed(
             u_min_mps2: params.u_min_mps2,
         }),
     };
+    let dt_s = scenario.dt_s();
+    let reached_m = own.x_m + dt_s * (own.v_mps + 0.5 * dt_s * params.u_max_mps2);
     Some(Owed {
+        counts: kind == DutyKind::RearEnd || reached_m >= duty.own_m,
         zone: assignment.zone,
         vehicle: own.vehicle,
         partner: partner.vehicle,

@@ -30,7 +30,7 @@ pub const METRICS: [Metric; 11] = [
     Metric { name: "time", unit: "s", decimals: 3, of: |z| Some(z.mean_time_s) },
     Metric { name: "energy", unit: "m²/s³", decimals: 3, of: |z| Some(z.mean_energy) },
     Metric { name: "objective", unit: "m²/s³", decimals: 3, of: |z| Some(z.mean_objective) },
-    Metric { name: "exposure", unit: "m s", decimals: 3, of: |z| Some(z.mean_exposure_m_s) },
+    Metric { name: "exposure", unit: "m\u{a0}s", decimals: 3, of: |z| Some(z.mean_exposure_m_s) },
     Metric { name: "FE vehicles", unit: "", decimals: 0, of: |z| Some(f64::from(z.fe_vehicles)) },
     Metric { name: "infeasible", unit: "", decimals: 0, of: |z| Some(f64::from(z.infeasible_vehicles)) },
     Metric { name: "rear-end margin", unit: "m", decimals: 2, of: |z| z.min_rear_end_margin_m },

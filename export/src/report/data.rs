@@ -221,6 +221,9 @@ impl<'a> Gathering<'a> {
         let mut least = vec![[f64::INFINITY; 3]; self.margins.len()];
         let pairs = &mut self.least;
         moment.in_force.owed(self.scenario, moment.step, |owed| {
+            if !owed.counts {
+                return;
+            }
             let margin_m = owed.margin_m();
             let kind = match owed.kind {
                 DutyKind::RearEnd => 0,

@@ -280,10 +280,14 @@ fn clustered(
     near_px: i32,
     between: &str,
 ) -> Vec<((i32, i32), String)> {
+    /// Width of half a character, pixels.
+    const HALF_PX: i32 = 4;
     let mut all: Vec<((i32, i32), String)> = Vec::new();
     for ((x, y), label) in labels {
-        let near =
-            |(at, _): &&mut ((i32, i32), String)| (at.0 - x).abs() < near_px && (at.1 - y).abs() < near_px;
+        let near = |(at, known): &&mut ((i32, i32), String)| {
+            let wide_px = HALF_PX * (known.len() + label.len()) as i32;
+            (at.0 - x).abs() < near_px.max(wide_px) && (at.1 - y).abs() < near_px
+        };
         match all.iter_mut().find(near) {
             Some((_, known)) if known.split(between).any(|known| known == label) => {}
             Some((_, known)) => *known = format!("{known}{between}{label}"),
@@ -368,13 +372,15 @@ fn profile<DB: DrawingBackend>(
 
 /// Margins above this concern nobody, m.
 const CLOSE_M: f64 = 25.0;
+/// By more than this the margin of one pair does not change in a step, m.
+const LEAP_M: f64 = 3.0;
 
 fn margins<DB: DrawingBackend>(area: &DrawingArea<DB, Shift>, run: &Run, zone: u32) -> Drawn<DB> {
     let margins = &run.margins[zone as usize];
     let series = [
         ("toward leaders", &margins.rear_end, COLOURS[0]),
-        ("toward merging partners", &margins.merge, COLOURS[4]),
-        ("toward crossing partners", &margins.cross, COLOURS[3]),
+        ("at merges", &margins.merge, COLOURS[4]),
+        ("at crossings", &margins.cross, COLOURS[3]),
     ];
     let all = || series.iter().flat_map(|(_, points, _)| points.iter()).map(|(_, margin)| *margin);
     let low = all().fold(0.0, f64::min);
@@ -392,14 +398,18 @@ fn margins<DB: DrawingBackend>(area: &DrawingArea<DB, Shift>, run: &Run, zone: u
         area.dim_in_pixel().1 as f64 / (high - low).max(1e-9),
     );
     let step_s = run.scenario.dt_s();
-    for (_, points, color) in &series {
-        // Where nobody owed anything there is no margin.
-        let goes_on =
-            |a: &(f64, f64), b: &(f64, f64)| b.0 - a.0 < 1.5 * step_s && (a.1 > high) == (b.1 > high);
-        for piece in points.chunk_by(goes_on).filter(|piece| piece[0].1 <= high) {
-            let points = simplified(piece.iter().copied(), scale);
-            chart.draw_series([PathElement::new(points, color.stroke_width(2))])?;
-        }
+    let [(_, leaders, color), others @ ..] = &series;
+    // Where nobody owed anything there is no margin, and where another pair has the least one the line does not lead.
+    let goes_on = |a: &(f64, f64), b: &(f64, f64)| {
+        b.0 - a.0 < 1.5 * step_s && (a.1 > high) == (b.1 > high) && (b.1 - a.1).abs() < LEAP_M
+    };
+    for piece in leaders.chunk_by(goes_on).filter(|piece| piece[0].1 <= high) {
+        let points = simplified(piece.iter().copied(), scale);
+        chart.draw_series([PathElement::new(points, color.stroke_width(2))])?;
+    }
+    for (_, points, color) in others {
+        let close = points.iter().filter(|(_, margin)| *margin <= high);
+        chart.draw_series(close.map(|at| Circle::new(*at, 3, color.filled())))?;
     }
     let origin = (plot.get_pixel_range().0.start, plot.get_pixel_range().1.start);
     let mut labels = Vec::new();
@@ -505,8 +515,9 @@ impl View {
     fn px(&self, place: Place) -> Option<(i32, i32)> {
         let [left, top, right, bottom] = self.frame;
         let (x, y) = self.at(place);
+        let (x, y) = (x.round(), y.round());
         let is_inside = (left..=right).contains(&x) && (top..=bottom).contains(&y);
-        is_inside.then_some((x.round() as i32, y.round() as i32))
+        is_inside.then_some((x as i32, y as i32))
     }
 
     /// The part of a line that is inside the frame (Liang and Barsky).

@@ -171,8 +171,9 @@ fn figures_of<'a>(runs: &'a [Run], latency: &'a [Latency]) -> Vec<Figure<'a>> {
         figures.push(Figure {
             name: slug(&format!("margins-{}", shape.name)),
             title: format!("Margins over time: {}", shape.name),
-            caption: "The least margin of all pairs of vehicles at each step; below zero somebody is closer than its \
-                      reaction time allows. Numbers are the worst moments in the table below."
+            caption: "The least margin toward leaders at each step (line), and toward those who pass first as a vehicle \
+                      comes to a merge or crossing (dots); below zero somebody is closer than its reaction time allows. \
+                      Numbers are the worst moments in the table below."
                 .to_owned(),
             size: (1100, 340),
             what: What::Margins { run, zone },

@@ -27,11 +27,15 @@ table{border-collapse:collapse;font-variant-numeric:tabular-nums;margin:8px 0;fo
 th,td{padding:3px 10px;text-align:left;border-bottom:1px solid var(--line);vertical-align:top}
 th{color:var(--dim);font-weight:600}td.n,th.n{text-align:right}td.n,td:first-child{white-space:nowrap}
 .wide{overflow-x:auto}figure{margin:12px 0}figcaption{color:var(--dim);font-size:14px;max-width:90ch}
-figure .wide{background:#fff;border:1px solid var(--line);border-radius:4px}figure svg{display:block;max-width:none}
+figure .wide{background:#fff;border:1px solid var(--line);border-radius:4px}figure svg{display:block}
+figure .fits svg{max-width:100%;height:auto}
 .warn{border-left:4px solid #d55e00;padding:4px 12px;background:var(--band)}
 details{margin:6px 0}summary{cursor:pointer}code{font-size:13px;background:var(--band);padding:1px 4px}
 tr:target,details:target{background:var(--band)}
 ";
+
+/// Width of the page's text, pixels.
+const TEXT_PX: u32 = 1140;
 
 /// Puts a page together.
 pub fn page(runs: &[Run], figures: &[(Figure<'_>, String)], latency: &[Latency]) -> String {
@@ -72,9 +76,11 @@ pub fn page(runs: &[Run], figures: &[(Figure<'_>, String)], latency: &[Latency])
     for (figure, svg) in figures {
         let _ = writeln!(
             page,
-            "<figure id=\"{}\"><h3>{}</h3><div class=\"wide\">{svg}</div><figcaption>{}</figcaption></figure>",
+            "<figure id=\"{}\"><h3>{}</h3><div class=\"{}\">{svg}</div><figcaption>{}</figcaption></figure>",
             figure.name,
             escape(&figure.title),
+            // One that is wider, as of a long run, is scrolled and not made small.
+            if figure.size.0 <= TEXT_PX { "wide fits" } else { "wide" },
             escape(&figure.caption)
         );
     }
@@ -296,8 +302,8 @@ fn differences(page: &mut String, groups: &[Group<'_>]) {
 fn moments(page: &mut String, run: &Run) {
     heading(page, "moments", "Worst moments");
     page.push_str(
-        "<p>The pairs with the least margins, toward leaders first. Toward a partner at a merge or crossing the margin is \
-         the barrier's value, which is the distance left only once the vehicle is there.</p>\n",
+        "<p>The pairs with the least margins, toward leaders first; toward those who pass a merge or crossing first as the \
+         vehicle comes to it.</p>\n",
     );
     let conflicts = Conflicts::of_all(&run.scenario.network);
     let rows = (1..).zip(&run.worst).map(|(number, worst)| {
