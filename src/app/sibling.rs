@@ -39,7 +39,8 @@ impl Sibling {
             let mut command = Command::new(cargo);
             command.args(["run", "--manifest-path"]).arg(manifest());
             command.args((!cfg!(debug_assertions)).then_some("--release"));
-            command.args(["--package", self.package, "--bin", self.program, "--"]);
+            // Not by package: the default members have the same features as when `cz` was built, so only what is new is.
+            command.args(["--bin", self.program, "--"]);
             return Ok(command);
         }
         let own = std::env::current_exe().map_err(|error| {
