@@ -27,8 +27,9 @@ const el = (tag, attributes = {}, ...children) => {
 const fill = (box, ...children) => box.replaceChildren(...children.flat().filter(child => child !== null && child !== undefined));
 const clamp = (x, low, high) => Math.min(high, Math.max(low, x));
 const fixed = (x, digits) => x === null || x === undefined || !Number.isFinite(x) ? "–" : x.toFixed(digits);
-// What a row leaves at one step by sampling is not a margin that was not kept.
-const isKept = margin => margin > -0.005;
+// What a row leaves at one step by sampling is not a margin that was not kept. What is owed at a merge or crossing
+// need not be there before the vehicle comes to it.
+const standing = duty => duty.margin_m > -0.005 ? "good" : duty.counts ? "bad" : "quiet";
 const margin_m = (margin, digits) => fixed(Math.abs(margin) < 0.5 * 10 ** -digits ? 0 : margin, digits);
 const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const query = params => Object.entries(params).map(([k, v]) => `${k}=${encodeURIComponent(v)}`).join("&");
@@ -245,7 +246,9 @@ function play() {
 }
 
 function select({ vehicle = null, zone = null, run = state.run }) {
+  const isOther = run !== state.run;
   Object.assign(state, { vehicle, zone, run, detail: null });
+  if (isOther) showTabs();
   if (vehicle === null) state.course = null;
   else if (state.course?.vehicle !== vehicle || state.course?.run !== run) { state.course = null; fetchCourse(); }
   if (vehicle === null) state.keeps = false;
@@ -262,18 +265,23 @@ async function fetchCourse() {
   } catch { /* it may not have been read yet */ }
 }
 
-let detailIsAsked = false;
+// Zones that are told of when nothing is chosen, and how often while traffic moves.
+const ZONES_TOLD = 12, ZONES_EVERY_MS = 250;
+let detailIsAsked = false, detailAt = 0;
 async function refreshDetail() {
   if (detailIsAsked) return;
+  const isOverview = state.vehicle === null && state.zone === null, moves = state.playing || state.follows;
+  if (isOverview && moves && state.detail?.zones && performance.now() - detailAt < ZONES_EVERY_MS) return;
   const { vehicle, zone, run } = state, step = clamp(now(), ...(state.runs[run] ? [state.runs[run].status.first ?? 0, state.runs[run].status.last ?? 0] : [0, 0]));
   const key = `${run} ${vehicle} ${zone} ${step}`;
   if (state.asked === key) return;
   state.asked = key;
   detailIsAsked = true;
+  detailAt = performance.now();
   try {
     if (vehicle !== null) state.detail = await ask("vehicle", { run, step, vehicle });
     else if (zone !== null) state.detail = await ask("zone", { run, step, zone });
-    else state.detail = { zones: await zonesOf(run, step) };
+    else state.detail = { zones: await ask("zones", { run, step, count: ZONES_TOLD }) };
   } catch (error) {
     state.detail = { problem: error.message };
   }
@@ -295,11 +303,6 @@ function followPath() {
   state.dirty = true;
 }
 
-// What the zones say of themselves, of the first few.
-async function zonesOf(run, step) {
-  const count = Math.min(12, state.runs[run]?.network.zones.length ?? 0);
-  return Promise.all(Array.from({ length: count }, (_, zone) => ask("zone", { run, step, zone }).catch(() => null)));
-}
 
 /* ---------------------------------------------------------------- colours */
 
@@ -346,17 +349,79 @@ function showLegend() {
   }
 }
 
+/* ---------------------------------------------------------------- vehicles */
+
+// Of more vehicles than these outlines are not drawn, and where they are shorter than so many pixels they are dots.
+const MANY = 2000, CAR_M = 4.5, DOT_PX = 6.5;
+
+// The vehicles of a map as they were drawn last, pixels: what is drawn, and what a click finds.
+class Drawn {
+  constructor() { this.count = 0; this.room = 0; }
+  begin(count) {
+    this.count = 0;
+    if (count <= this.room) return;
+    this.room = 2 * count;
+    this.id = new Uint32Array(this.room);
+    this.colour = new Uint8Array(this.room);
+    this.x = new Float32Array(this.room);
+    this.y = new Float32Array(this.room);
+    this.front = new Float32Array(2 * this.room);
+    this.rear = new Float32Array(2 * this.room);
+  }
+  add(id, fx, fy, rx, ry, colour) {
+    const i = this.count++;
+    this.id[i] = id;
+    this.colour[i] = colour;
+    this.x[i] = (fx + rx) / 2;
+    this.y[i] = (fy + ry) / 2;
+    this.front[2 * i] = fx; this.front[2 * i + 1] = fy;
+    this.rear[2 * i] = rx; this.rear[2 * i + 1] = ry;
+  }
+}
+
+// Very many vehicles, as squares of pixels put there by hand: a tenth of what as many calls of the canvas cost.
+class Dots {
+  draw(context, { count, x, y, colour }, palette, ratio) {
+    const { width, height } = context.canvas;
+    if (this.image?.width !== width || this.image.height !== height) {
+      this.image = new ImageData(width, height);
+      this.words = new Uint32Array(this.image.data.buffer);
+      this.palette = null;
+    }
+    if (this.palette !== palette) { this.palette = palette; this.inks = palette.map(inkOf); }
+    const { words, inks } = this, size = Math.round(4 * ratio), half = size >> 1;
+    words.fill(0);
+    for (let i = 0; i < count; i++) {
+      const left = Math.round(x[i] * ratio) - half, top = Math.round(y[i] * ratio) - half, ink = inks[colour[i]];
+      const right = Math.min(width, left + size), bottom = Math.min(height, top + size), from = Math.max(0, left);
+      if (from >= right) continue;
+      for (let row = Math.max(0, top); row < bottom; row++) words.fill(ink, row * width + from, row * width + right);
+    }
+    context.putImageData(this.image, 0, 0);
+  }
+}
+// A colour as the pixel has it.
+function inkOf(colour) {
+  const context = new OffscreenCanvas(1, 1).getContext("2d");
+  context.fillStyle = colour;
+  context.fillRect(0, 0, 1, 1);
+  return new Uint32Array(context.getImageData(0, 0, 1, 1).data.buffer)[0];
+}
+
 /* ---------------------------------------------------------------- maps */
 
 class CzMap {
   constructor(run) {
     this.run = run;
+    // What lies still is a picture of its own behind what moves.
+    this.ground = el("canvas", { class: "ground" });
     this.canvas = el("canvas", { tabindex: "0", "aria-label": `Map of ${run.name}` });
     this.name = el("div", { class: "name" });
     const button = (text, title, act) => el("button", { title, "aria-label": title, onclick: act }, text);
-    this.box = el("div", { class: "map" }, this.canvas, this.name, el("div", { class: "zoom" },
+    this.box = el("div", { class: "map" }, this.ground, this.canvas, this.name, el("div", { class: "zoom" },
       button("+", "Zoom in (+)", () => zoom(1.5)), button("−", "Zoom out (−)", () => zoom(1 / 1.5)), button("⤢", "Show all (0)", fit)));
-    this.shown = []; // where vehicles were drawn, for clicks: number, x, y
+    this.shown = new Drawn();
+    this.dots = new Dots();
     new ResizeObserver(() => this.resize()).observe(this.box);
     this.listen();
   }
@@ -401,9 +466,10 @@ class CzMap {
   }
   pick(px, py) {
     let best = null, least = 14 ** 2;
-    for (let i = 0; i < this.shown.length; i += 3) {
-      const d = (this.shown[i + 1] - px) ** 2 + (this.shown[i + 2] - py) ** 2;
-      if (d < least) { least = d; best = this.shown[i]; }
+    const { count, id, x, y } = this.shown;
+    for (let i = 0; i < count; i++) {
+      const d = (x[i] - px) ** 2 + (y[i] - py) ** 2;
+      if (d < least) { least = d; best = id[i]; }
     }
     if (best !== null) return select({ vehicle: best, run: this.run.index });
     const zone = this.run.geometry.zoneAt(...this.world(px, py), 14 / state.view.scale);
@@ -412,20 +478,26 @@ class CzMap {
   draw() {
     const { canvas } = this, ratio = devicePixelRatio || 1, context = canvas.getContext("2d"), v = state.view;
     if (!v || !this.width) return;
-    context.setTransform(1, 0, 0, 1, 0, 0);
-    context.clearRect(0, 0, canvas.width, canvas.height);
-    context.drawImage(this.groundOf(v, ratio), 0, 0);
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    this.drawVehicles(context);
+    this.drawGround(v, ratio);
+    this.placeVehicles();
+    const count = this.frame?.count ?? 0;
+    if (count > MANY && v.scale * CAR_M < DOT_PX) {
+      this.dots.draw(context, this.shown, state.palettes[state.colour], ratio);
+      context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    } else {
+      context.setTransform(1, 0, 0, 1, 0, 0);
+      context.clearRect(0, 0, canvas.width, canvas.height);
+      context.setTransform(ratio, 0, 0, ratio, 0, 0);
+      this.drawVehicles(context);
+    }
     this.drawDuties(context);
   }
-  // What lies still, drawn once for each view of it.
-  groundOf(v, ratio) {
+  // Drawn once for each view of it.
+  drawGround(v, ratio) {
     const { canvas, run } = this, t = state.theme, zone = state.run === run.index ? state.zone : null;
     const key = [v.x, v.y, v.scale, canvas.width, canvas.height, document.documentElement.dataset.theme, zone].join(" ");
-    if (this.groundKey === key) return this.ground;
+    if (this.groundKey === key) return;
     this.groundKey = key;
-    this.ground ??= document.createElement("canvas");
     this.ground.width = canvas.width;
     this.ground.height = canvas.height;
     const context = this.ground.getContext("2d");
@@ -457,7 +529,6 @@ class CzMap {
     if (v.scale > 2) this.drawArrows(context);
     this.drawPoints(context);
     this.drawNames(context);
-    return this.ground;
   }
   // Which way lanes lead, every sixty metres or so.
   drawArrows(context) {
@@ -538,86 +609,86 @@ class CzMap {
     this.taken.push([lx, ly, half]);
     written(context, text, lx, ly);
   }
-  drawVehicles(context) {
-    const frame = this.frame, next = this.next, { run } = this, v = state.view;
-    this.shown.length = 0;
+  // Where everybody is at the instant that is shown.
+  placeVehicles() {
+    const { frame, next, run, shown } = this, v = state.view;
+    shown.begin(frame?.count ?? 0);
     if (!frame) return;
     const since = Math.max(0, state.time - frame.step), share = next ? Math.min(1, since / (next.step - frame.step)) : Math.min(1, since);
-    // They get names of their own.
-    const partners = new Set(state.run === run.index ? state.detail?.duties?.map(duty => duty.partner) ?? [] : []);
-    const palette = state.palettes[state.colour], bins = palette.map(() => []), front = [0, 0], rear = [0, 0];
-    const halfWidth = Math.max(0.95, 2.3 / v.scale), dtS = run.dt_s, labels = [], cabins = [];
-    const areDots = frame.count > 2000 && v.scale * 4.5 < 6.5;
-    const isLarge = v.scale * 4.5 > 16, marks = v.scale > 2.4 && frame.count < 400;
+    const ahead_s = share * (next ? next.step - frame.step : 1) * run.dt_s;
     const [left, top] = this.world(-30, -30), [right, bottom] = this.world(this.width + 30, this.height + 30);
+    const { u32, f32 } = frame, front = [0, 0], rear = [0, 0], halfWidth = this.width / 2, halfHeight = this.height / 2;
     let hint = 0;
     for (let i = 0; i < frame.count; i++) {
-      const at = frame.at(i), id = frame.u32[at], zone = frame.u32[at + 1], path = frame.u32[at + 2];
-      const course = run.geometry.course(zone, path);
+      const at = frame.at(i), zone = u32[at + 1], path = u32[at + 2], course = run.geometry.course(zone, path);
       if (!course) continue;
-      let x = frame.f32[at + 3], speed = frame.f32[at + 4];
+      let x = f32[at + 3], speed = f32[at + 4];
       if (share > 0) {
-        const j = next ? next.find(id, hint) : -1, to = j < 0 ? -1 : next.at(j);
+        const j = next ? next.find(u32[at], hint) : -1, to = j < 0 ? -1 : next.at(j);
         hint = j < 0 ? hint : j + 1;
         if (to >= 0 && next.u32[to + 1] === zone && next.u32[to + 2] === path) {
           x += share * (next.f32[to + 3] - x);
           speed += share * (next.f32[to + 4] - speed);
-        } else x += share * (next ? next.step - frame.step : 1) * dtS * speed;
+        } else x += ahead_s * speed;
       }
       course.locate(x, front);
       if (front[0] < left || front[0] > right || front[1] > top || front[1] < bottom) continue;
-      const length = frame.f32[at + 6];
+      const length = f32[at + 6];
       course.locate(x - length, rear);
       let dx = front[0] - rear[0], dy = front[1] - rear[1];
-      const d = Math.hypot(dx, dy) || 1;
+      const d = Math.hypot(dx, dy) || 1, long = Math.max(length * v.scale, 6.5);
       dx /= d; dy /= d;
-      const [fx, fy] = this.px(front[0], front[1]), long = Math.max(length * v.scale, 6.5), wide = halfWidth * v.scale;
-      const rx = fx - dx * long, ry = fy + dy * long, ox = dy * wide, oy = dx * wide;
-      bins[colourOf(frame, at, speed, run.v_max_mps)].push(fx + ox, fy + oy, fx - ox, fy - oy, rx - ox, ry - oy, rx + ox, ry + oy);
-      if (isLarge) cabins.push(fx - 0.28 * (fx - rx), fy - 0.28 * (fy - ry), ox * 0.78, oy * 0.78, (fx - rx) * 0.16, (fy - ry) * 0.16);
-      const mx = (fx + rx) / 2, my = (fy + ry) / 2;
-      this.shown.push(id, mx, my);
-      if (marks && id !== state.vehicle && !partners.has(id)) labels.push(id, mx + ox, my, wide);
+      const fx = halfWidth + (front[0] - v.x) * v.scale, fy = halfHeight - (front[1] - v.y) * v.scale;
+      shown.add(u32[at], fx, fy, fx - dx * long, fy + dy * long, colourOf(frame, at, speed, run.v_max_mps));
     }
+  }
+  drawVehicles(context) {
+    const { frame, shown, run } = this, v = state.view;
+    if (!frame) return;
+    const { count, id, colour, front, rear, x: middleX, y: middleY } = shown, palette = state.palettes[state.colour];
+    const wide = Math.max(0.95 * v.scale, 2.3), isLarge = v.scale * CAR_M > 16;
     context.lineWidth = isLarge ? 1 : 0.8;
     context.strokeStyle = isLarge ? state.theme.outline : "rgb(10 16 28 / 60%)";
-    bins.forEach((corners, i) => {
-      if (!corners.length) return;
-      context.fillStyle = palette[i];
-      if (areDots) {
-        for (let k = 0; k < corners.length; k += 8) context.fillRect(Math.round((corners[k] + corners[k + 4]) / 2) - 2, Math.round((corners[k + 1] + corners[k + 5]) / 2) - 2, 4, 4);
-        return;
-      }
+    palette.forEach((fill, which) => {
+      context.fillStyle = fill;
       context.beginPath();
-      for (let k = 0; k < corners.length; k += 8) {
-        context.moveTo(corners[k], corners[k + 1]);
-        context.lineTo(corners[k + 2], corners[k + 3]);
-        context.lineTo(corners[k + 4], corners[k + 5]);
-        context.lineTo(corners[k + 6], corners[k + 7]);
+      let isAny = false;
+      for (let i = 0; i < count; i++) {
+        if (colour[i] !== which) continue;
+        isAny = true;
+        const fx = front[2 * i], fy = front[2 * i + 1], rx = rear[2 * i], ry = rear[2 * i + 1], d = Math.hypot(fx - rx, fy - ry) || 1;
+        const ox = (ry - fy) / d * wide, oy = (fx - rx) / d * wide;
+        context.moveTo(fx + ox, fy + oy); context.lineTo(fx - ox, fy - oy); context.lineTo(rx - ox, ry - oy); context.lineTo(rx + ox, ry + oy);
         context.closePath();
       }
+      if (!isAny) return;
       context.fill();
-      if (frame.count < 2000) context.stroke();
+      if (frame.count < MANY) context.stroke();
     });
-    if (cabins.length) {
+    if (isLarge) {
+      // Wind screens, so that it is seen where the front is.
       context.fillStyle = "rgb(255 255 255 / 55%)";
       context.beginPath();
-      for (let k = 0; k < cabins.length; k += 6) {
-        const [x, y, ox, oy, lx, ly] = cabins.slice(k, k + 6);
-        context.moveTo(x + ox, y + oy); context.lineTo(x - ox, y - oy); context.lineTo(x - ox - lx, y - oy - ly); context.lineTo(x + ox - lx, y + oy - ly);
+      for (let i = 0; i < count; i++) {
+        const lx = front[2 * i] - rear[2 * i], ly = front[2 * i + 1] - rear[2 * i + 1], d = Math.hypot(lx, ly) || 1;
+        const ox = -ly / d * wide * 0.78, oy = lx / d * wide * 0.78, px = front[2 * i] - 0.28 * lx, py = front[2 * i + 1] - 0.28 * ly;
+        context.moveTo(px + ox, py + oy); context.lineTo(px - ox, py - oy); context.lineTo(px - ox - 0.16 * lx, py - oy - 0.16 * ly); context.lineTo(px + ox - 0.16 * lx, py + oy - 0.16 * ly);
         context.closePath();
       }
       context.fill();
     }
-    if (labels.length) {
+    if (v.scale > 2.4 && frame.count < 400) {
+      // The chosen vehicle and its partners get names of their own.
+      const named = new Set(state.run === run.index ? state.detail?.duties?.map(duty => duty.partner) ?? [] : []).add(state.vehicle);
       context.font = "10px system-ui, 'DejaVu Sans', sans-serif";
       context.textAlign = "center";
       context.fillStyle = state.theme.quiet;
-      for (let k = 0; k < labels.length; k += 4) written(context, labels[k], labels[k + 1], labels[k + 2] - labels[k + 3] - 5);
+      for (let i = 0; i < count; i++) if (!named.has(id[i])) written(context, id[i], middleX[i], middleY[i] - wide - 5);
     }
   }
   placeOf(vehicle) {
-    for (let i = 0; i < this.shown.length; i += 3) if (this.shown[i] === vehicle) return [this.shown[i + 1], this.shown[i + 2]];
+    const { count, id, x, y } = this.shown;
+    for (let i = 0; i < count; i++) if (id[i] === vehicle) return [x[i], y[i]];
     return null;
   }
   drawDuties(context) {
@@ -630,7 +701,7 @@ class CzMap {
     for (const duty of duties) {
       const partner = this.placeOf(duty.partner);
       if (!partner) continue;
-      const colour = isKept(duty.margin_m) ? t.good : t.bad, dx = partner[0] - own[0], dy = partner[1] - own[1], d = Math.hypot(dx, dy) || 1;
+      const colour = t[standing(duty)], dx = partner[0] - own[0], dy = partner[1] - own[1], d = Math.hypot(dx, dy) || 1;
       // Bent aside, so that lines along a lane can be told from it and from each other.
       const times = told.get(duty.partner) ?? 0, bend = (0.16 + 0.14 * times) * Math.min(d, 320);
       told.set(duty.partner, times + 1);
@@ -675,9 +746,10 @@ class CzMap {
     context.textAlign = "center";
     context.lineWidth = 3;
     context.strokeStyle = state.theme.pane;
-    context.strokeText(text, x, y + radius + 13);
+    // Above: names of zones and roads are below.
+    context.strokeText(text, x, y - radius - 5);
     context.fillStyle = colour;
-    context.fillText(text, x, y + radius + 13);
+    context.fillText(text, x, y - radius - 5);
   }
 }
 // Text that can be read on anything.
@@ -738,7 +810,7 @@ function showVehicle(box, d) {
   const rows = (duties ?? []).map(duty => el("tr", { "data-vehicle": duty.partner, onclick: () => select({ vehicle: duty.partner }) },
     el("td", {}, duty.kind), el("td", {}, `${duty.partner}${duty.partner_has_left ? " (left)" : ""}`),
     el("td", {}, duty.point_name === null ? "ahead" : duty.point_name), el("td", { class: "num" }, duty.to_go_m === null ? "" : fixed(duty.to_go_m, 1)),
-    el("td", { class: `num ${isKept(duty.margin_m) ? "good" : "bad"}` }, margin_m(duty.margin_m, 2))));
+    el("td", { class: `num ${standing(duty)}` }, margin_m(duty.margin_m, 2))));
   fill(box,
     el("div", { class: "head" }, el("h2", {}, `Vehicle ${d.vehicle}`), el("span", { class: "quiet" }, d.kind === null ? "" : `${d.kind}, ${d.length_m} m`), runName(), closer()),
     el("table", { class: "facts" },
@@ -794,7 +866,7 @@ function showOverview(box, d) {
     const all = exits.map(told);
     return all.length <= 3 ? all.join(" · ") : [...new Set(all)].filter(text => text !== "–").join(" · ") || "–";
   };
-  const rows = d.zones.filter(Boolean).map(zone => el("tr", { "data-zone": zone.zone, onclick: () => select({ zone: zone.zone }) },
+  const rows = d.zones.map(zone => el("tr", { "data-zone": zone.zone, onclick: () => select({ zone: zone.zone }) },
     el("td", {}, zone.name), el("td", { class: "num" }, String(zone.n)), el("td", { class: "num" }, speeds(zone.exits))));
   const more = run.network.zones.length - d.zones.length;
   const differs = state.runs[1]?.status.differs_at;
@@ -846,7 +918,7 @@ function prepare(canvas) {
   return { context, width, height };
 }
 // Axes with ticks; returns how to place things in it.
-function axes(canvas, { x0, x1, y0, y1, xName = "time [s]", yName, left = 46, right = 12, top = 8, bottom = 26, rows = 4 }) {
+function axes(canvas, { x0, x1, y0, y1, xName = "time [s]", yName, left = 46, right = 12, top = 8, bottom = 22, rows = 4 }) {
   const { context, width, height } = prepare(canvas), t = state.theme;
   if (!(x1 > x0)) x1 = x0 + 1;
   if (!(y1 > y0)) y1 = y0 + 1;
@@ -856,32 +928,42 @@ function axes(canvas, { x0, x1, y0, y1, xName = "time [s]", yName, left = 46, ri
   context.fillStyle = t.quiet;
   context.lineWidth = 1;
   context.textAlign = "center";
+  // The axis is named in the line of its numbers, which leave room for it.
+  const isBeside = right > 60, nameWidth = context.measureText(xName).width;
   for (const x of ticks(x0, x1, clamp(w / 90, 2, 14))) {
     context.beginPath(); context.moveTo(X(x), top); context.lineTo(X(x), top + h); context.stroke();
-    context.fillText(String(+x.toPrecision(6)), X(x), top + h + 14);
+    const text = String(+x.toPrecision(6)), end = X(x) + context.measureText(text).width / 2 + 6;
+    if (isBeside || end < left + w - nameWidth) context.fillText(text, X(x), top + h + 15);
   }
   context.textAlign = "right";
   for (const y of ticks(y0, y1, rows)) {
     context.beginPath(); context.moveTo(left, Y(y)); context.lineTo(left + w, Y(y)); context.stroke();
     context.fillText(String(+y.toPrecision(6)), left - 5, Y(y) + 4);
   }
-  context.textAlign = "right";
-  context.fillText(xName, left + w, top + h + 24);
+  context.textAlign = isBeside ? "left" : "right";
+  context.fillText(xName, left + w + (isBeside ? 22 : 0), top + h + 15);
   context.save(); context.translate(11, top + h / 2); context.rotate(-Math.PI / 2); context.textAlign = "center"; context.fillText(yName, 0, 0); context.restore();
   const clip = () => { context.save(); context.beginPath(); context.rect(left, top, w, h); context.clip(); };
   return { context, X, Y, clip, left, top, w, h, x0, x1, y0, y1, xAt: px => x0 + (px - left) / w * (x1 - x0), yAt: py => y0 + (top + h - py) / h * (y1 - y0) };
 }
-function line(chart, xs, ys, colour, { width = 1.6, dash = [] } = {}) {
+function line(chart, xs, ys, colour, { width = 1.6, dash = [], leap = Infinity } = {}) {
   const { context, X, Y } = chart;
   context.strokeStyle = colour; context.lineWidth = width; context.setLineDash(dash);
   context.beginPath();
   let pen = false;
   for (let i = 0; i < xs.length; i++) {
     if (ys[i] === null || ys[i] === undefined) { pen = false; continue; }
-    if (pen) context.lineTo(X(xs[i]), Y(ys[i])); else context.moveTo(X(xs[i]), Y(ys[i]));
+    if (pen && Math.abs(ys[i] - ys[i - 1]) < leap) context.lineTo(X(xs[i]), Y(ys[i])); else context.moveTo(X(xs[i]), Y(ys[i]));
     pen = true;
   }
   context.stroke(); context.setLineDash([]);
+}
+function dots({ context, X, Y }, xs, ys, colour) {
+  context.fillStyle = colour;
+  for (let i = 0; i < xs.length; i++) {
+    if (ys[i] === null || ys[i] === undefined) continue;
+    context.beginPath(); context.arc(X(xs[i]), Y(ys[i]), 2.4, 0, 7); context.fill();
+  }
 }
 function cursor(chart, x) {
   const { context, X, top, h } = chart;
@@ -895,14 +977,20 @@ function drawSpeed() {
   if (!canvas?.isConnected || !course || !course.step.length) return;
   const seconds = course.step.map(step => step * run.dt_s), plan = state.detail?.plan ?? [];
   const x1 = Math.max(seconds[seconds.length - 1], ...plan.map(p => Math.min(p[0], seconds[seconds.length - 1] + 15)));
-  const chart = axes(canvas, { x0: seconds[0], x1, y0: 0, y1: Math.max(...course.v_mps, ...plan.map(p => p[2])) * 1.1 + 0.5, yName: "v [m/s]", left: 34, bottom: 34, rows: 3 });
+  const chart = axes(canvas, { x0: seconds[0], x1, y0: 0, y1: Math.max(...course.v_mps, ...plan.map(p => p[2])) * 1.1 + 0.5, yName: "v [m/s]", left: 34, bottom: 22, rows: 3 });
   side.chart = chart;
   const { context, X, top, h } = chart;
-  course.step.forEach((step, i) => {
-    if (course.verdict[i] === null) return;
-    context.fillStyle = state.palettes.verdict[Math.min(5, course.verdict[i])];
-    context.fillRect(X(seconds[i]), top + h - 5, Math.max(1, X(seconds[i] + run.dt_s) - X(seconds[i])), 5);
-  });
+  // A piece for as long as the verdict is the same.
+  for (let i = 0; i < seconds.length;) {
+    let end = i + 1;
+    while (end < seconds.length && course.verdict[end] === course.verdict[i]) end++;
+    const from = Math.round(X(seconds[i])), to = Math.round(X(seconds[Math.min(end, seconds.length - 1)]));
+    if (course.verdict[i] !== null) {
+      context.fillStyle = state.palettes.verdict[Math.min(5, course.verdict[i])];
+      context.fillRect(from, top + h - 5, Math.max(1, to - from), 5);
+    }
+    i = end;
+  }
   for (const visit of course.visits.slice(1)) {
     context.strokeStyle = state.theme.ghost; context.setLineDash([2, 3]); context.lineWidth = 1;
     context.beginPath(); context.moveTo(X(visit.time_s), top); context.lineTo(X(visit.time_s), top + h); context.stroke(); context.setLineDash([]);
@@ -915,7 +1003,8 @@ function drawSpeed() {
 }
 
 const PANELS = [["Time–space", drawSpaceTime], ["Margins", drawMargins], ["Traffic", drawTraffic], ["Step latency", drawLatency]];
-const plot = { chart: null, traces: new Map(), lines: null };
+// `version` counts what has come, `isWhole` is said by what is drawn: whether more will come by itself.
+const plot = { chart: null, traces: new Map(), lines: null, version: 0, isWhole: true, key: null, kept: null };
 
 function showTabs() {
   $("tabs").replaceChildren(...PANELS.map(([name], i) => el("button", { class: i === state.panel ? "is-on" : null, title: `${name} (${i + 1})`, onclick: () => { state.panel = i; showTabs(); } }, name)));
@@ -929,10 +1018,11 @@ function showTabs() {
     const pathSelect = choose(paths, state.path, value => { state.path = value; });
     pathSelect.id = "path";
     options.replaceChildren("path", pathSelect, "span", choose(spans, state.span, value => { state.span = +value; }));
-  } else if (state.panel === 1) options.replaceChildren(legend("toward leaders", "ink"), legend("at merges", "m-fe"), legend("at crossings", "m-other"), "least of all vehicles");
-  else if (state.panel === 2) options.replaceChildren(legend("vehicles", "ink"), legend("bound by rows", "v-2"), legend("FE", "v-1"), legend("infeasible", "v-3"));
+  } else if (state.panel === 1) options.replaceChildren(legend("toward leaders", "ink"), legend("at merges", "m-fe"), legend("at crossings", "m-other"), ...behind(), "least of all vehicles");
+  else if (state.panel === 2) options.replaceChildren(legend("vehicles", "ink"), legend("bound by rows", "v-2"), legend("FE", "v-1"), legend("infeasible", "v-3"), ...behind());
   else options.replaceChildren(legend("longest step", "ink"), legend("controllers not in time", "m-other"));
 }
+const behind = () => state.runs.filter(run => run.index !== state.run).map(run => legend(run.name.replace(/\.czlog$/, ""), "ghost"));
 function legend(text, name) {
   return el("span", {}, el("i", { style: { display: "inline-block", width: "14px", height: "3px", background: state.theme[name], marginRight: "5px", verticalAlign: "3px" } }), text);
 }
@@ -940,7 +1030,8 @@ function legend(text, name) {
 function window_s() {
   const [first, last] = bounds(), x = state.time * dt();
   if (!state.span || (last - first) * dt() <= state.span) return [first * dt(), Math.max(last * dt(), first * dt() + 1)];
-  const from = clamp(x - state.span * 0.6, first * dt(), last * dt() - state.span);
+  // It moves on by a quarter at a time, and is drawn again only then.
+  const jump = state.span / 4, from = clamp(Math.floor((x - state.span / 2) / jump) * jump, first * dt(), last * dt() - state.span);
   return [from, from + state.span];
 }
 // Traces of a zone in blocks of steps, fetched once when they are complete.
@@ -970,8 +1061,10 @@ function tracesOf(run, zone, from, to) {
           trace.step.push(u32[i + 1]); trace.x.push(f32[i + 3]); trace.v.push(f32[i + 4]);
         }
         mine.vehicles = vehicles;
+        plot.version++;
       }).catch(() => plot.traces.delete(key)).finally(() => { mine.busy = false; });
     }
+    plot.isWhole &&= entry.isWhole;
     all.push(entry.vehicles);
   }
   return all;
@@ -1028,28 +1121,35 @@ function wholeRun(yName, y0, y1, canvas, right = 12) {
   const [first, last] = bounds();
   return axes(canvas, { x0: first * dt(), x1: Math.max(last * dt(), first * dt() + 1), y0, y1, yName, right });
 }
+// What is drawn behind the chosen run: the same of the others, grey.
+const others = () => (plot.lines ?? []).filter((_, i) => i !== state.run);
+const at = lines => lines.step.map(step => step * dt());
+// Another pair's margin, not a change of this one's.
+const LEAP_M = 6;
 const values = list => list.filter(x => x !== null && x !== undefined);
 function drawMargins(canvas) {
   const all = plot.lines?.[state.run];
   if (!all) return null;
   const seen = values([...all.rear_end_m, ...all.merge_m, ...all.cross_m]);
-  const chart = wholeRun("least margin [m]", clamp(Math.min(-2, ...seen), -15, 0), 20, canvas), seconds = all.step.map(step => step * dt());
+  const chart = wholeRun("least margin [m]", clamp(Math.min(-2, ...seen), -15, 0), 20, canvas), seconds = at(all);
   chart.clip();
-  const { context, X, Y } = chart;
+  const { context, Y } = chart;
   context.fillStyle = state.theme.bad; context.globalAlpha = 0.09; context.fillRect(chart.left, Y(0), chart.w, chart.h); context.globalAlpha = 1;
-  line(chart, seconds, all.cross_m, state.theme["m-other"], { width: 1.2 });
-  line(chart, seconds, all.merge_m, state.theme["m-fe"], { width: 1.2 });
-  line(chart, seconds, all.rear_end_m, state.theme.ink, { width: 1.2 });
+  for (const other of others()) line(chart, at(other), other.rear_end_m, state.theme.ghost, { width: 1.2, leap: LEAP_M });
+  line(chart, seconds, all.rear_end_m, state.theme.ink, { width: 1.2, leap: LEAP_M });
+  dots(chart, seconds, all.cross_m, state.theme["m-other"]);
+  dots(chart, seconds, all.merge_m, state.theme["m-fe"]);
   context.strokeStyle = state.theme.bad; context.lineWidth = 1; context.beginPath(); context.moveTo(chart.left, Y(0)); context.lineTo(chart.left + chart.w, Y(0)); context.stroke();
   context.restore();
-  void X;
   return chart;
 }
 function drawTraffic(canvas) {
   const all = plot.lines?.[state.run];
   if (!all) return null;
-  const chart = wholeRun("vehicles", 0, Math.max(4, ...all.vehicles) * 1.08, canvas), seconds = all.step.map(step => step * dt());
+  const most = Math.max(4, ...plot.lines.flatMap(lines => lines.vehicles));
+  const chart = wholeRun("vehicles", 0, most * 1.08, canvas), seconds = at(all);
   chart.clip();
+  for (const other of others()) line(chart, at(other), other.vehicles, state.theme.ghost, { width: 2 });
   line(chart, seconds, all.bound, state.theme["v-2"]);
   line(chart, seconds, all.fe, state.theme["v-1"]);
   line(chart, seconds, all.infeasible, state.theme["v-3"]);
@@ -1076,9 +1176,26 @@ function drawLatency(canvas) {
 }
 function drawPanel() {
   if ($("panels").classList.contains("is-off") || !state.runs.length) return;
-  const canvas = $("plot").firstElementChild, chart = PANELS[state.panel][1](canvas);
-  plot.chart = chart;
-  if (chart) cursor(chart, state.time * dt());
+  const canvas = $("plot").firstElementChild, more = plot.isWhole ? "" : Math.floor(performance.now() / 700);
+  const key = [
+    state.panel, canvas.clientWidth, canvas.clientHeight, devicePixelRatio, document.documentElement.dataset.theme, state.run,
+    state.path, state.vehicle, state.vehicle === null ? "" : state.detail?.step, ...window_s(), plot.version, more,
+    ...state.runs.flatMap(run => [run.status.first, run.status.last, run.status.known, run.status.is_complete]),
+  ].join(" ");
+  // But for the cursor it is what it was, mostly.
+  if (key !== plot.key) {
+    plot.key = key;
+    plot.isWhole = true;
+    plot.chart = PANELS[state.panel][1](canvas);
+    plot.kept ??= document.createElement("canvas");
+    plot.kept.width = canvas.width;
+    plot.kept.height = canvas.height;
+    if (canvas.width && canvas.height) plot.kept.getContext("2d").drawImage(canvas, 0, 0);
+  } else {
+    const { context } = prepare(canvas);
+    if (canvas.width && canvas.height) context.drawImage(plot.kept, 0, 0, canvas.clientWidth, canvas.clientHeight);
+  }
+  if (plot.chart) cursor(plot.chart, state.time * dt());
 }
 let linesAt = 0, linesOf = "";
 async function refreshLines() {
@@ -1089,6 +1206,7 @@ async function refreshLines() {
     plot.lines = await Promise.all(state.runs.map(run => ask("lines", { run: run.index, bins: 900 })));
     for (const run of state.runs) if (run.status.events !== run.events?.length) run.events = (await ask("events", { run: run.index })).events;
     drawTicks();
+    plot.version++;
     state.dirty = true;
   } catch { linesOf = ""; }
 }
@@ -1159,17 +1277,25 @@ function keep() {
   const [x, y] = map.world(...place);
   state.view = { ...state.view, x, y, isFitted: false };
 }
+// Whether this is news: what the page says already is not put there again sixty times a second.
+const saidOf = new Map();
+function told(what, text) {
+  if (saidOf.get(what) === text) return false;
+  saidOf.set(what, text);
+  return true;
+}
 function showClock() {
   const step = now();
-  $("clock").replaceChildren(el("b", {}, `${(state.time * dt()).toFixed(1)} s`), ` step ${step}`);
+  const instant = `${(state.time * dt()).toFixed(1)} s`;
+  if (told("clock", `${instant} ${step}`)) $("clock").replaceChildren(el("b", {}, instant), ` step ${step}`);
   const scrub = $("scrub"), [first, last] = bounds();
-  scrub.min = first; scrub.max = last;
-  if (document.activeElement !== scrub || state.playing || state.follows) scrub.value = step;
-  $("play").textContent = state.playing ? "❚❚" : "▶";
+  if (told("range", `${first} ${last}`)) { scrub.min = first; scrub.max = last; }
+  if (document.activeElement !== scrub || state.playing || state.follows) { if (told("scrub", `${step} ${first} ${last}`) || +scrub.value !== step) scrub.value = step; }
+  if (told("play", state.playing)) $("play").textContent = state.playing ? "❚❚" : "▶";
   $("follow").classList.toggle("is-on", state.follows);
   for (const map of state.maps) {
     const text = `${map.frame?.count ?? 0} vehicles`;
-    map.name.replaceChildren(state.runs.length > 1 ? map.run.name : map.run.scenario, el("span", {}, text));
+    if (told(`map ${map.run.index}`, text)) map.name.replaceChildren(state.runs.length > 1 ? map.run.name : map.run.scenario, el("span", {}, text));
   }
   const set = (field, text) => { const cell = document.querySelector(`#side [data-field=${field}]`); if (cell && text) cell.textContent = text; };
   const own = state.maps[state.run]?.frame;

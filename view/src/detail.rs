@@ -104,6 +104,7 @@ impl Run {
                 "point_name": shape.map(|point| point.name.clone()),
                 "to_go_m": shape.map(|_| owed.own_m - state.x_m),
                 "margin_m": owed.margin_m(),
+                "counts": owed.counts,
             }));
         });
         Value::Array(duties)
@@ -181,7 +182,17 @@ impl Run {
 
     /// A zone in a step: passing order, number of vehicles, terminal speeds.
     pub fn zone(&self, number: u64, zone: u32) -> Result<Value, String> {
+        self.zone_in(&self.step(number)?, zone)
+    }
+
+    /// The first zones in a step.
+    pub fn zones(&self, number: u64, count: u64) -> Result<Value, String> {
         let step = self.step(number)?;
+        let zones = self.scenario.network.zones.len() as u64;
+        (0..count.min(zones) as u32).map(|zone| self.zone_in(&step, zone)).collect()
+    }
+
+    fn zone_in(&self, step: &Step, zone: u32) -> Result<Value, String> {
         let shape = self
             .scenario
             .network
@@ -189,7 +200,7 @@ impl Run {
             .get(zone as usize)
             .ok_or_else(|| format!("there is no zone {zone}"))?;
         let slice = of_zone(&step.state, zone);
-        let in_force = self.in_force(zone, &step);
+        let in_force = self.in_force(zone, step);
         let assigned = in_force.as_ref().map_or(&[][..], |in_force| in_force.of(zone));
         let mut order: Vec<(u32, u32)> = assigned.iter().map(|a| (a.rank, a.vehicle)).collect();
         order.sort_unstable();
@@ -217,7 +228,7 @@ impl Run {
         Ok(json!({
             "zone": zone,
             "name": shape.name,
-            "step": number,
+            "step": step.header.step,
             "n": slice.iter().filter(|s| !s.has_left()).count(),
             "order": in_force.is_some().then(|| order.iter().copied().filter_map(member).collect::<Vec<_>>()),
             "exits": exits.collect::<Vec<_>>(),

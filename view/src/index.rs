@@ -203,6 +203,9 @@ impl Index {
 
     fn take_margins(&mut self, scenario: &Scenario, step: &Step, line: &mut Line) {
         self.in_force.owed(scenario, step, |owed| {
+            if !owed.counts {
+                return;
+            }
             let least = match owed.kind {
                 DutyKind::RearEnd => &mut line.least[0],
                 DutyKind::Merge => &mut line.least[1],

@@ -190,6 +190,7 @@ fn answer(served: &Served, what: &str, q: &Question) -> Response {
         "vehicle" => said(run.vehicle(q.step, q.vehicle)),
         "course" => said(run.course(q.vehicle)),
         "zone" => said(run.zone(q.step, q.zone)),
+        "zones" => said(run.zones(q.step, q.count)),
         "lines" => said(Ok(run.lines(q.bins))),
         "events" => said(Ok(run.events())),
         _ => not_there(format!("there is nothing called {what}")),

@@ -6,7 +6,7 @@ use serde_json::{Value, json};
 use std::cell::{Cell, RefCell};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 use tungstenite::{Message, WebSocket};
@@ -75,8 +75,7 @@ impl Browser {
             complaints: RefCell::default(),
             _profile: profile,
         };
-        let metrics = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": false });
-        browser.call("Emulation.setDeviceMetricsOverride", metrics);
+        browser.resize((width, height));
         browser.call("Runtime.enable", json!({}));
         browser.call("Log.enable", json!({}));
         browser.call("Page.enable", json!({}));
@@ -150,11 +149,16 @@ impl Browser {
         }
     }
 
-    /// Writes a picture of the page.
-    pub fn picture(&self, path: &Path) {
+    /// Makes the window so large.
+    pub fn resize(&self, (width, height): (u32, u32)) {
+        let metrics = json!({ "width": width, "height": height, "deviceScaleFactor": 1, "mobile": false });
+        self.call("Emulation.setDeviceMetricsOverride", metrics);
+    }
+
+    /// What is to be seen of the page, as PNG.
+    pub fn picture(&self) -> Vec<u8> {
         let result = self.call("Page.captureScreenshot", json!({ "format": "png" }));
-        let bytes = data_encoding::BASE64.decode(result["data"].as_str().unwrap().as_bytes()).unwrap();
-        std::fs::write(path, bytes).unwrap();
+        data_encoding::BASE64.decode(result["data"].as_str().unwrap().as_bytes()).unwrap()
     }
 }
 
