@@ -123,6 +123,17 @@ fn may_hide(conflicts: &Conflicts, nearer: &Row, other: &Row) -> bool {
     !other.has_left || conflicts.exit(nearer.path) == conflicts.exit(other.path)
 }
 
+/// Whether one that passes a point behind another on its lane goes on behind it for so many metres. Otherwise it may have
+/// come further from the point, by another way, than the one that passed it first.
+fn goes_along(conflicts: &Conflicts, nearer: &Row, other: &Row, point: u32, for_m: f64) -> bool {
+    let Some(passes) = conflicts.uses(nearer.path).iter().find(|u| u.point == point) else { return false };
+    let mut goes = false;
+    conflicts.runs((nearer.path, nearer.next_path), (other.path, other.next_path), |run| {
+        goes |= run.from_m <= passes.at_m && passes.at_m + for_m <= run.to_m;
+    });
+    goes
+}
+
 /// The duties of one zone's vehicles; kept from use to use for its allocations.
 #[derive(Clone, Debug, Default)]
 pub struct Duties {
@@ -237,14 +248,17 @@ impl Duties {
                 let other = &rows[at];
                 let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
                 let Some(theirs) = theirs.filter(|u| !u.on_lane_of(own)) else { continue };
+                let gap_m = point.area_m + other.length_m;
                 let hides = |&(lane, nearer): &(u32, usize)| {
-                    lane == theirs.lane() && may_hide(conflicts, &rows[nearer], other)
+                    let nearer = &rows[nearer];
+                    lane == theirs.lane()
+                        && may_hide(conflicts, nearer, other)
+                        && goes_along(conflicts, nearer, other, own.point, gap_m + row.reach_m)
                 };
                 if lanes.iter().any(hides) {
                     continue;
                 }
                 lanes.push((theirs.lane(), at));
-                let gap_m = point.area_m + other.length_m;
                 let until_m = theirs.at_m + gap_m + row.reach_m;
                 if other.x_m < until_m {
                     all.push(Duty {

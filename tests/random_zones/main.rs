@@ -168,12 +168,12 @@ fn margins_hold_behind_leaders_that_stop() {
     withstands("leaders that stop", leaders_that_stop);
 }
 
-fn attack_all(text: &str) -> Result<Vec<(u64, u64)>, TestCaseError> {
+fn attack_all(text: &str, is_roomy: bool) -> Result<Vec<(u64, u64)>, TestCaseError> {
     let load = || control_zones::scenario::load_given(text, Vec::new(), &[], None).unwrap();
     [
-        attack(load(), (true, ""), 900, always_u_max()),
-        attack(load(), (true, ""), 900, random_flips()),
-        attack(load(), (true, ""), 900, leaders_that_stop()),
+        attack(load(), (is_roomy, ""), 900, always_u_max()),
+        attack(load(), (is_roomy, ""), 900, random_flips()),
+        attack(load(), (is_roomy, ""), 900, leaders_that_stop()),
     ]
     .into_iter()
     .collect()
@@ -182,14 +182,16 @@ fn attack_all(text: &str) -> Result<Vec<(u64, u64)>, TestCaseError> {
 /// What was found here once.
 #[test]
 fn margins_hold_where_once_they_did_not() {
-    for (name, text) in [
+    for (name, is_roomy, text) in [
         // Whoever has turned off leaves its tail in the lane, and another between it and those behind.
-        ("turns off beside a tail", include_str!("once/turns-off-beside-a-tail.toml")),
-        ("turns off and merges again", include_str!("once/turns-off-and-merges-again.toml")),
+        ("turns off beside a tail", true, include_str!("once/turns-off-beside-a-tail.toml")),
+        ("turns off and merges again", true, include_str!("once/turns-off-and-merges-again.toml")),
         // It comes to stand at the merge to the last bit, and goes on when the other is far enough.
-        ("stands at a merge", include_str!("once/stands-at-a-merge.toml")),
+        ("stands at a merge", true, include_str!("once/stands-at-a-merge.toml")),
+        // One that crossed before it goes a shorter way to the exit, where it stands, than another that crossed between.
+        ("clears by a shorter way", false, include_str!("once/clears-by-a-shorter-way.toml")),
     ] {
-        attack_all(text).unwrap_or_else(|e| panic!("{name}: {e}"));
+        attack_all(text, is_roomy).unwrap_or_else(|e| panic!("{name}: {e}"));
     }
 }
 
@@ -198,7 +200,7 @@ fn margins_hold_where_once_they_did_not() {
 #[ignore = "needs a file"]
 fn a_network_from_a_file() {
     let text = std::fs::read_to_string(std::env::var("CZ_NETWORK").unwrap()).unwrap();
-    println!("{:?}", attack_all(&text).unwrap());
+    println!("{:?}", attack_all(&text, true).unwrap());
 }
 
 /// The built-in law gets everybody through, in both orders, and so does a controller that only pushes.
