@@ -401,8 +401,11 @@ impl Viable {
             k_per_s: self.params.k_comfort_per_s,
             u_min_mps2: vehicle.u_min_mps2,
         };
-        if rear_end.margin_m(&pair) < 0.0 {
-            rear_end.k_per_s = self.params.k_recovery_per_s;
+        let margin_m = rear_end.margin_m(&pair);
+        if margin_m < 0.0 {
+            // Effort and exposure cost least with u = -sqrt(2 price |m|), were the leader as fast: m' = -phi u.
+            let braking = (2.0 * self.params.price_of_exposure_mps4).sqrt();
+            rear_end.k_per_s = vehicle.reaction_time_s * braking / (-margin_m).sqrt();
         }
         rear_end.sampled_row(&pair, self.dt_s)
     }

@@ -10,8 +10,9 @@ use ipc_schemas::{
 #[derive(Clone, Debug)]
 pub struct Audience {
     neighbours: Vec<Neighbour>,
-    /// How far it is from the origin of each path to the zone behind it, m.
-    onward_m: Vec<f64>,
+    /// How far it is from the origin of each path to the zone behind it, m, where that begins at its end: when and how
+    /// fast a vehicle comes over a link is not the coordinators' to decide.
+    onward_m: Vec<Option<f64>>,
     /// Whether neighbours are told of each vehicle.
     in_detail: bool,
 }
@@ -38,8 +39,7 @@ impl Audience {
             Neighbour { zone: n, segment_m, is_upstream }
         });
         let own = &network.zones[zone as usize];
-        let link_m = |path| own.exit_of(path).to.map_or(0.0, |to| to.link_m);
-        let onward_m = (0..).zip(&own.paths).map(|(index, path)| path.length_m + link_m(index));
+        let onward_m = (0..own.paths.len() as u32).map(|path| own.onward_m(path));
         Audience {
             neighbours: neighbours.collect(),
             onward_m: onward_m.collect(),
@@ -81,15 +81,15 @@ impl Audience {
             kind: state.kind,
             ..all
         };
-        let comes = state.next_zone == neighbour.zone;
-        let coming = ZoneSummary {
-            x_m: state.x_m - self.onward_m[state.path as usize],
+        let onward_m = self.onward_m[state.path as usize].filter(|_| state.next_zone == neighbour.zone);
+        let coming = onward_m.map(|onward_m| ZoneSummary {
+            x_m: state.x_m - onward_m,
             path: state.next_path,
             next_path: state.then_path,
             flags: SUMMARY_COMING,
             ..told
-        };
-        comes.then_some(coming).into_iter().chain(neighbour.is_upstream.then_some(told))
+        });
+        coming.into_iter().chain(neighbour.is_upstream.then_some(told))
     }
 }
 

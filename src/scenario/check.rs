@@ -44,7 +44,7 @@ impl Scenario {
         let viable = &control.viable;
         for (key, value) in [
             (&keys::K_COMFORT, viable.k_comfort_per_s),
-            (&keys::K_RECOVERY, viable.k_recovery_per_s),
+            (&keys::PRICE_OF_EXPOSURE, viable.price_of_exposure_mps4),
             (&keys::CLEARANCE, viable.clearance_m),
             (&keys::BUFFER, viable.buffer_m),
             (&keys::BUFFER_TIME, viable.buffer_s),

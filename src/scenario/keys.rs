@@ -176,11 +176,11 @@ pub(in crate::scenario) static SLOTS: Flag =
     Flag { name: "slots", default: DEFAULT.slots, meaning: "whether slots behind partners are kept" };
 pub(in crate::scenario) static K_COMFORT: Number =
     number("k_comfort_per_s", ranges::GAIN, DEFAULT.k_comfort_per_s, "gain of the comfort row");
-pub(in crate::scenario) static K_RECOVERY: Number = number(
-    "k_recovery_per_s",
-    ranges::GAIN,
-    DEFAULT.k_recovery_per_s,
-    "the same where the margin is negative",
+pub(in crate::scenario) static PRICE_OF_EXPOSURE: Number = number(
+    "price_of_exposure_mps4",
+    ranges::PRICE_OF_EXPOSURE,
+    DEFAULT.price_of_exposure_mps4,
+    "what a metre of missing margin costs a second, by which it is made up",
 );
 pub(in crate::scenario) static CLEARANCE: Number = number(
     "clearance_m",
@@ -208,7 +208,7 @@ pub(in crate::scenario) static VIABLE: Keys = &[
     &BODIES,
     &SLOTS,
     &K_COMFORT,
-    &K_RECOVERY,
+    &PRICE_OF_EXPOSURE,
     &CLEARANCE,
     &BUFFER,
     &BUFFER_TIME,

@@ -216,6 +216,12 @@ impl Zone {
         &self.exits[self.paths[path as usize].exit as usize]
     }
 
+    /// How far it is from the origin of a path to the zone behind it, m, where that begins at the path's end.
+    pub fn onward_m(&self, path: u32) -> Option<f64> {
+        let to = self.exit_of(path).to.filter(|to| to.link_m == 0.0);
+        to.map(|_| self.paths[path as usize].length_m)
+    }
+
     /// Whether lanes, paths, exits and crossings are the same; names of zones, flow policies, orders and laws may
     /// differ.
     pub fn same_shape(&self, other: &Zone) -> bool {

@@ -143,8 +143,8 @@ pub struct ViableParams {
     pub slots: bool,
     /// Gain of the comfort row, 1/s.
     pub k_comfort_per_s: f64,
-    /// The same where the margin is negative, 1/s.
-    pub k_recovery_per_s: f64,
+    /// What a metre of missing margin costs a second, m/s^4: where it is negative, the comfort row recovers accordingly.
+    pub price_of_exposure_mps4: f64,
     /// Distance between bodies that the second tier keeps, m.
     pub clearance_m: f64,
     /// Distance added to a slot, m,
@@ -163,7 +163,7 @@ impl ViableParams {
         bodies: true,
         slots: true,
         k_comfort_per_s: 2.0,
-        k_recovery_per_s: 1.55,
+        price_of_exposure_mps4: 0.877,
         clearance_m: 1.0,
         buffer_m: 0.3,
         buffer_s: 3.0,

@@ -59,6 +59,8 @@ pub(super) const FLOW_SPEED: Range = range("a speed", 0.01, 1000.0, "m/s");
 pub(super) const FLOW_GAIN: Range = range("a gain", 0.0, 1000.0, "m/s per vehicle");
 /// `offset_mps` of a flow policy.
 pub(super) const FLOW_OFFSET: Range = range("a speed difference", -1000.0, 1000.0, "m/s");
+/// `control.viable.price_of_exposure_mps4`.
+pub(super) const PRICE_OF_EXPOSURE: Range = Range { zero: true, ..range("a price", 1e-6, 1e6, "m/s^4") };
 /// `coordination.price_of_time`.
 pub(super) const PRICE_OF_TIME: Range = range("a share", 0.0, 100.0, "");
 /// `coordination.tandem_weight`.

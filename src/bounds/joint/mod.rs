@@ -4,7 +4,7 @@
 //! driven exactly, and instants follow from speeds. Cost is the sum of the zones' mean costs. Toward the vehicle
 //! ahead on the same path, at each place, and toward the one that passes a merge before it, at its own passing, a
 //! vehicle keeps `phi v + delta`, as instants: it is nowhere before the other was that far ahead. A vehicle that comes
-//! in closer than that may stay closer for a while, by as much as decays at a rate, the least of `RECOVERIES_PER_S` at which it is
+//! in closer than that may stay closer for a while, by as much as decays at a rate, the least of `RECOVERIES` at which it is
 //! not more exposed than what it is compared with.
 //!
 //! Cost is nearly convex in the speeds, instants are not: a sequence of quadratic programs (`program`), each
@@ -19,8 +19,11 @@ use program::{Step, step};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Rates at which missing distance must be made up, 1/s.
-const RECOVERIES_PER_S: [f64; 7] = [0.6, 0.7, 0.8, 0.9, 1.0, 1.25, 1.6];
+/// Rates at which missing distance must be made up: so many, 1/s, the first, and how much each is above the one before.
+const RECOVERIES: usize = 32;
+const RECOVERIES_PER_S: (f64, f64) = (0.6, 0.05);
+/// Exposure is integrated by trapezoids, so many to a stretch.
+const PARTS: usize = 8;
 /// Length of the stretches of constant acceleration, about, m.
 const STRETCH_M: f64 = 12.5;
 /// Programs at most.
@@ -110,15 +113,20 @@ pub(super) struct Problem {
 /// Who may stay too close for longer has less to do: the optimum is that of the least recovery at which its exposure, per
 /// vehicle and over all zones, is at most `most_exposure_ms`, m s, or else that of the greatest.
 pub fn seek(traffic: &Traffic<'_>, courses: &[Vec<Course>], most_exposure_ms: f64) -> Option<Found> {
+    let at = |rate: usize| seek_at(traffic, courses, RECOVERIES_PER_S.0 + RECOVERIES_PER_S.1 * rate as f64);
+    // The faster it is made up for, the less exposed.
+    let (mut slow, mut fast) = (0, RECOVERIES - 1);
     let mut found = None;
-    for recovery_per_s in RECOVERIES_PER_S {
-        found = seek_at(traffic, courses, recovery_per_s);
-        let exposure_ms = found.as_ref()?.exposure_ms.iter().sum::<f64>();
-        if exposure_ms <= most_exposure_ms {
-            break;
+    while slow < fast {
+        let middle = (slow + fast) / 2;
+        let tried = at(middle)?;
+        if tried.exposure_ms.iter().sum::<f64>() <= most_exposure_ms {
+            (fast, found) = (middle, Some(tried));
+        } else {
+            slow = middle + 1;
         }
     }
-    found
+    found.or_else(|| at(fast))
 }
 
 fn seek_at(traffic: &Traffic<'_>, courses: &[Vec<Course>], recovery_per_s: f64) -> Option<Found> {
@@ -267,15 +275,21 @@ impl Problem {
         let mut exposure_ms = vec![0.0; zones];
         for owes in &self.owes {
             let (Some(zone), own) = (owes.rear_end, &self.drives[owes.drive]) else { continue };
-            let instant_s = own.instants_s[owes.place];
-            let there_m =
-                self.drives[owes.to].position_m(instant_s) - owes.shift_m - own.places_m[owes.place];
-            let needed_m =
-                self.vehicle.reaction_time_s * own.speeds_mps[owes.place] + self.vehicle.standstill_gap_m;
-            // Each place stands for the stretch before it.
-            let stretch_s = instant_s - own.instants_s[owes.place.max(1) - 1];
+            let leg = own.ends.partition_point(|end| *end < owes.place);
+            if own.zones[leg] != zone || owes.place == 0 {
+                continue;
+            }
+            let (from_s, to_s) = (own.instants_s[owes.place - 1], own.instants_s[owes.place]);
+            let missing_m = |part: usize| {
+                let instant_s = from_s + (to_s - from_s) * part as f64 / PARTS as f64;
+                let ((x_m, v_mps), (ahead_m, _)) =
+                    (own.motion(instant_s), self.drives[owes.to].motion(instant_s));
+                let needed_m = self.vehicle.reaction_time_s * v_mps + self.vehicle.standstill_gap_m;
+                (needed_m - (ahead_m - owes.shift_m - x_m)).max(0.0)
+            };
+            let sum_m: f64 = (0..PARTS).map(|part| 0.5 * (missing_m(part) + missing_m(part + 1))).sum();
             exposure_ms[zone as usize] +=
-                (needed_m - there_m).max(0.0) * stretch_s / passing[zone as usize].max(1.0);
+                sum_m * (to_s - from_s) / PARTS as f64 / passing[zone as usize].max(1.0);
         }
         let rises = self.drives.iter().flat_map(|d| {
             let squares = d.speeds_mps.windows(2).map(|v| v[1] * v[1] - v[0] * v[0]);
@@ -398,14 +412,20 @@ impl Drive {
 
     /// Where it is, m.
     fn position_m(&self, instant_s: f64) -> f64 {
+        self.motion(instant_s).0
+    }
+
+    /// Where it is, m, and how fast, m/s.
+    fn motion(&self, instant_s: f64) -> (f64, f64) {
         let last = self.places_m.len() - 1;
         if instant_s >= self.instants_s[last] {
-            return self.places_m[last] + self.speeds_mps[last] * (instant_s - self.instants_s[last]);
+            let beyond_m = self.speeds_mps[last] * (instant_s - self.instants_s[last]);
+            return (self.places_m[last] + beyond_m, self.speeds_mps[last]);
         }
         let place = self.instants_s.partition_point(|t| *t <= instant_s).max(1) - 1;
         let (a, b, length_m) = (self.speeds_mps[place], self.speeds_mps[place + 1], self.lengths_m[place]);
         let (after_s, u) = (instant_s - self.instants_s[place], 0.5 * (b * b - a * a) / length_m);
-        self.places_m[place] + (a + 0.5 * u * after_s) * after_s
+        (self.places_m[place] + (a + 0.5 * u * after_s) * after_s, a + u * after_s)
     }
 }
 

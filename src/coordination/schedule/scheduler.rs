@@ -5,13 +5,13 @@ use super::cost::{Cost, Single, Tandem};
 use super::pooling::best_s;
 use crate::conflict::{Conflicts, Duties, Row};
 use crate::coordination::assign::row;
-use crate::scenario::{CoordinationParams, PassingOrder, Scenario, ScheduleKind, VehicleParams, ZoneId};
+use crate::scenario::{
+    CoordinationParams, PassingOrder, Scenario, ScheduleKind, VehicleParams, Zone, ZoneId,
+};
 use ipc_schemas::{NO_VEHICLE, SUMMARY_COMING, VehicleState, ZoneSummary};
 
 /// What the time of those that others come behind weighs more, as a share of the price: these are scheduled themselves.
 const PRICE_WHEN_FOLLOWED: f64 = 0.3;
-/// How often the schedules of two zones are worked out in turn.
-const EXCHANGES: u32 = 2;
 /// Whoever leaves sooner than this is scheduled for the end of the next zone as if it were in it already, s.
 const NEARLY_THERE_S: f64 = 1.0;
 
@@ -95,8 +95,11 @@ impl Scene<'_> {
     /// Whether those that are about to come are scheduled together with the zone's own: in tandem, where they will pass
     /// in order of entry. Where newcomers may be put ahead of others their place is not known before they are there.
     pub(in crate::coordination) fn expects_in_order(&self) -> bool {
-        let zone = &self.scenario.network.zones[self.slice[0].zone as usize];
-        self.is_tandem() && zone.order == PassingOrder::Fifo
+        self.is_tandem() && self.zone().order == PassingOrder::Fifo
+    }
+
+    fn zone(&self) -> &Zone {
+        &self.scenario.network.zones[self.slice[0].zone as usize]
     }
 
     fn params(&self) -> &CoordinationParams {
@@ -151,6 +154,20 @@ impl Scene<'_> {
     }
 }
 
+/// Where a vehicle that is about to come is by now, m before the zone, negative, and how fast, m/s: since it was told of it
+/// has driven on by a plan whose acceleration ends at zero.
+fn on_its_way(told: &ZoneSummary, time_s: f64) -> (f64, f64) {
+    let (way_m, v_mps, exit_mps) = (-told.x_m, told.v_mps.max(0.0), told.planned_exit_speed_mps.max(0.1));
+    let left_s = (told.planned_exit_time_s - time_s).max(0.0);
+    let whole_s = 3.0 * way_m / (2.0 * exit_mps + v_mps);
+    if whole_s <= left_s {
+        return (told.x_m, v_mps);
+    }
+    let u_mps2 = 3.0 * (way_m - v_mps * whole_s) / (whole_s * whole_s);
+    let slower_mps = 0.5 * u_mps2 * left_s * left_s / whole_s;
+    (-(exit_mps - slower_mps / 3.0) * left_s, exit_mps - slower_mps)
+}
+
 /// Whether what a neighbour tells of a vehicle can be reckoned with.
 fn is_sound(told: &ZoneSummary, paths: usize) -> bool {
     let finite = [told.x_m, told.v_mps, told.planned_exit_time_s, told.planned_exit_speed_mps];
@@ -167,19 +184,9 @@ impl Scheduler {
         self.prepare(scene, queue);
         self.times_s.clear();
         self.times_s.extend_from_slice(self.chain.schedule(&self.passages, duties, left, &self.costs));
-        if scene.is_tandem() {
-            for _ in 0..EXCHANGES {
-                if !self.look_beyond(scene, &at[left..]) {
-                    break;
-                }
-                self.times_s.clear();
-                self.times_s.extend_from_slice(self.chain.schedule(
-                    &self.passages,
-                    duties,
-                    left,
-                    &self.costs,
-                ));
-            }
+        if scene.is_tandem() && self.look_beyond(scene, &at[left..]) {
+            self.times_s.clear();
+            self.times_s.extend_from_slice(self.chain.schedule(&self.passages, duties, left, &self.costs));
         }
         &self.times_s[..members]
     }
@@ -208,7 +215,10 @@ impl Scheduler {
                     (told.kind, told.planned_exit_time_s)
                 }
             };
-            let passage = scene.passage(scene.conflicts, row, kind);
+            let mut passage = scene.passage(scene.conflicts, row, kind);
+            if let Some(told) = place.checked_sub(at.len()).map(|told| &coming[told]) {
+                (passage.x_m, passage.v_mps) = on_its_way(told, scene.time_s);
+            }
             passages.push(passage);
             if place < left {
                 continue;
@@ -219,7 +229,7 @@ impl Scheduler {
             betas.push(weighed);
             let (left_m, v_mps) = (passage.left_m(), passage.v_mps);
             let entry_s = planned_s - scene.time_s;
-            costs.push(if entry_s <= NEARLY_THERE_S || row.x_m >= 0.0 {
+            costs.push(if entry_s <= NEARLY_THERE_S || passage.x_m >= 0.0 {
                 Cost::Single(Single { beta: weighed, left_m, v_mps })
             } else {
                 Cost::Second(
@@ -227,7 +237,7 @@ impl Scheduler {
                         first_beta: 0.0,
                         second_beta: weighed,
                         weight: 1.0,
-                        first_m: -row.x_m,
+                        first_m: -passage.x_m,
                         second_m: passage.length_m,
                         v_mps,
                     },
@@ -249,7 +259,8 @@ impl Scheduler {
             let Some(conflicts) = &heard.conflicts else { continue };
             let goes_there = |&vehicle: &usize| {
                 let state = &scene.slice[members[vehicle] as usize];
-                state.next_zone == heard.from && times_s[vehicle] > NEARLY_THERE_S
+                let is_direct = scene.zone().onward_m(state.path).is_some();
+                state.next_zone == heard.from && is_direct && times_s[vehicle] > NEARLY_THERE_S
             };
             beyond.whom.clear();
             beyond.whom.extend((0..members.len()).filter(goes_there));
@@ -267,9 +278,8 @@ impl Scheduler {
                 let price = scene.params().price_of_time * if is_last { 1.0 } else { PRICE_WHEN_FOLLOWED };
                 let state = &scene.slice[members[vehicle] as usize];
                 let own = &passages[left + vehicle];
-                let link_m = link_m(scene.scenario, state);
                 let mut row = row(scene.scenario, state, beyond.rows.len() as u32);
-                row.x_m = -(own.left_m() + link_m);
+                row.x_m = -own.left_m();
                 (row.path, row.next_path) = (state.next_path, state.then_path);
                 let there = scene.passage(conflicts, &row, state.kind);
                 beyond.rows.push(row);
@@ -279,7 +289,7 @@ impl Scheduler {
                     second_beta: weight * beta * (1.0 + price),
                     weight,
                     first_m: own.left_m(),
-                    second_m: link_m + there.length_m,
+                    second_m: there.length_m,
                     v_mps: own.v_mps,
                 };
                 beyond.costs.push(Cost::Second(tandem, times_s[vehicle]));
@@ -319,10 +329,4 @@ impl Beyond {
             self.passages.push(passage);
         }
     }
-}
-
-/// Length of the link a vehicle takes to its next zone, m.
-fn link_m(scenario: &Scenario, state: &VehicleState) -> f64 {
-    let exit = scenario.network.zones[state.zone as usize].exit_of(state.path);
-    exit.to.map_or(0.0, |to| to.link_m)
 }

@@ -163,7 +163,7 @@ fn viable(t: &Table<'_>) -> Result<ViableParams, ScenarioError> {
         bodies: t.flag(&keys::BODIES)?,
         slots: t.flag(&keys::SLOTS)?,
         k_comfort_per_s: t.number_or(&keys::K_COMFORT, default.k_comfort_per_s)?,
-        k_recovery_per_s: t.number_or(&keys::K_RECOVERY, default.k_recovery_per_s)?,
+        price_of_exposure_mps4: t.number_or(&keys::PRICE_OF_EXPOSURE, default.price_of_exposure_mps4)?,
         clearance_m: t.number_or(&keys::CLEARANCE, default.clearance_m)?,
         buffer_m: t.number_or(&keys::BUFFER, default.buffer_m)?,
         buffer_s: t.number_or(&keys::BUFFER_TIME, default.buffer_s)?,
