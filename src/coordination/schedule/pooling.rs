@@ -448,7 +448,8 @@ pub fn root(f: impl Fn(f64) -> Slope, start: f64, from: f64, to: f64) -> f64 {
             break;
         }
         let newton = at - value / rise;
-        let next = if rise > 0.0 && newton > low && newton < high && (newton - at).abs() <= 0.75 * last {
+        let (is_above, is_below) = (newton > low, newton < high);
+        let next = if rise > 0.0 && is_above && is_below && (newton - at).abs() <= 0.75 * last {
             // Beside a slope that is steep enough steps are short however far away the root is, and become longer.
             let step = (newton - at).abs();
             if step <= FOUND * newton.abs() && step <= SHRINKING * last_newton {
@@ -456,9 +457,9 @@ pub fn root(f: impl Fn(f64) -> Slope, start: f64, from: f64, to: f64) -> f64 {
             }
             last_newton = step;
             newton
-        } else if value < 0.0 && !is_high_known && !(newton < high) {
+        } else if value < 0.0 && !is_high_known && !is_below {
             high
-        } else if value > 0.0 && !is_low_known && !(newton > low) {
+        } else if value > 0.0 && !is_low_known && !is_above {
             low
         } else {
             0.5 * (low + high)
