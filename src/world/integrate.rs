@@ -166,12 +166,18 @@ impl World {
         let cars = &self.cars[zone];
         kept.extend_from_slice(&cars[..first]);
         moved.extend_from_slice(&motions[..first]);
-        for (car, held) in cars[first..].iter().zip(&motions[first..]) {
-            let length_m = lengths_m[car.path as usize];
-            let Some(after_s) = held.passes_m(length_m, dt_s) else { continue };
+        // Those that leave at one instant leave in passing order: one may stand at the end that another comes through.
+        for &at in &self.order[zone] {
+            let (car, held) = (&cars[at as usize], &motions[at as usize]);
+            let Some(after_s) = held.passes_m(lengths_m[car.path as usize], dt_s) else { continue };
             let exit = shape.paths[car.path as usize].exit;
             let beyond = Beyond { zone: zone as ZoneId, exit, next_exit: 0 };
             leaving.push((after_s, Car { beyond, ..*car }, *held));
+        }
+        leaving.sort_by(|a, b| a.0.total_cmp(&b.0));
+        for (after_s, car, held) in &*leaving {
+            let (after_s, length_m) = (*after_s, lengths_m[car.path as usize]);
+            let exit = car.beyond.exit;
             let mut visit = car.visit;
             visit.energy += held.energy(after_s);
             let instant_s = now_s + after_s;
@@ -212,7 +218,6 @@ impl World {
                 entries.push(Entry { zone: down, car: next });
             }
         }
-        leaving.sort_by(|a, b| a.0.total_cmp(&b.0));
         kept.extend(leaving.iter().map(|(_, car, _)| *car));
         moved.extend(leaving.iter().map(|(.., held)| *held));
         // Of those that have left the last toward each way stays, and whoever may still stand in a conflict area.
@@ -346,10 +351,8 @@ impl World {
         if entries.is_empty() {
             return;
         }
-        entries.sort_by(|a, b| {
-            let key = |e: &Entry| (e.zone, e.car.entry_time_s, e.car.path);
-            key(a).partial_cmp(&key(b)).expect("instants of entry are finite")
-        });
+        // Those that enter at one instant are in the order in which they left the zone or the link before.
+        entries.sort_by(|a, b| a.zone.cmp(&b.zone).then(a.car.entry_time_s.total_cmp(&b.car.entry_time_s)));
         for entry in entries {
             self.cars.push(entry.zone as usize, entry.car);
             self.events.push(entry.zone);

@@ -190,6 +190,8 @@ fn margins_hold_where_once_they_did_not() {
         ("stands at a merge", true, include_str!("once/stands-at-a-merge.toml")),
         // One that crossed before it goes a shorter way to the exit, where it stands, than another that crossed between.
         ("clears by a shorter way", false, include_str!("once/clears-by-a-shorter-way.toml")),
+        // One stands at the end of its way when another leaves through it: at one instant, in passing order.
+        ("leaves at the same instant", true, include_str!("once/leaves-at-the-same-instant.toml")),
     ] {
         attack_all(text, is_roomy).unwrap_or_else(|e| panic!("{name}: {e}"));
     }
