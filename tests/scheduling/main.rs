@@ -88,7 +88,7 @@ proptest! {
         let scale = slope.abs().max(single.beta).max(cost.value(t) / t);
         prop_assert!((numerical - slope).abs() < 1e-5 * scale, "{numerical} {slope}");
         prop_assert!(cost.slope(1.01 * t).value >= slope - 1e-12 * scale);
-        if at < 0.9 || at > 1.1 {
+        if !(0.9..=1.1).contains(&at) {
             rises(|t| cost.slope(t), t)?;
         }
     }
