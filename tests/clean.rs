@@ -91,12 +91,13 @@ fn a_killed_run_is_removed_and_a_live_one_goes_on() {
     clean(&test_run, &std::env::temp_dir(), &[]);
     let alive = common::unique_name("alive");
     let in_process = test_run.summary(&["corridor-8", "--in-process"]);
-    let (supervisor, dying) = start_long(&test_run, test_run.name(), PACED);
+    // The other run is there first: whoever begins one removes what dead runs have left.
     let (survivor, parts) = start_long(&test_run, &alive, &["--json", "-"]);
     // It stands still while others are cleared away, so that it is certainly there.
     let has_services = || files(Some(test_run.runs().parent().unwrap()), &alive).len() > 10;
     wait_until("the other run to have services", has_services);
     stop_without_lock(&test_run, world(&parts));
+    let (supervisor, dying) = start_long(&test_run, test_run.name(), PACED);
     wait_until("the run to have files", || test_run.files().len() > 10);
     massacre(supervisor, &dying);
     let left = test_run.files();
