@@ -8,7 +8,7 @@ mod runs;
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{DefaultSettingsBuilder, DefaultSolver, IPSolver, NonnegativeConeT, SolverStatus};
 use control_zones::coordination::schedule::cost::{Convex, Cost, Single, Slope, Tandem};
-use control_zones::coordination::schedule::pooling::{Headway, Pooling, best_s, is_chain};
+use control_zones::coordination::schedule::pooling::{Headway, Pooling, Program, best_s, is_chain};
 use proptest::prelude::*;
 
 fn cases(cases: u32) -> ProptestConfig {
@@ -147,7 +147,8 @@ fn alone_s<C: Convex>(costs: &[C]) -> Vec<f64> {
 
 fn optimum<C: Convex + Clone>(cost: &C) -> f64 {
     let mut times = Vec::new();
-    Pooling::default().minimise(std::slice::from_ref(cost), &[best_s(cost)], &[0.0], &[], &mut times);
+    let (costs, alone_s) = (std::slice::from_ref(cost), &[best_s(cost)]);
+    Pooling::default().minimise(&Program { costs, alone_s, earliest_s: &[0.0], headways: &[] }, &mut times);
     times[0]
 }
 
@@ -235,7 +236,9 @@ proptest! {
         let costs: Vec<Quadratic> = drawn.iter().map(|&(weight, best, _)| Quadratic { weight, best }).collect();
         let earliest: Vec<f64> = drawn.iter().map(|d| d.2).collect();
         let mut times = Vec::new();
-        Pooling::default().minimise(&costs, &alone_s(&costs), &earliest, &headways, &mut times);
+        let program =
+            Program { costs: &costs, alone_s: &alone_s(&costs), earliest_s: &earliest, headways: &headways };
+        Pooling::default().minimise(&program, &mut times);
         prop_assert!(keeps(&times, &earliest, &headways), "{times:?}");
         let value = |times: &[f64]| -> f64 {
             times.iter().zip(&costs).map(|(t, c)| 0.5 * c.weight * (t - c.best) * (t - c.best)).sum()
@@ -263,9 +266,10 @@ proptest! {
         let (mut times, mut again) = (Vec::new(), Vec::new());
         let changed: Vec<Headway> =
             headways.iter().zip(&others).map(|(h, &by)| Headway { headway_s: h.headway_s + by, ..*h }).collect();
-        pooling.minimise(&costs, &alone, &earliest, &changed, &mut again);
-        pooling.minimise_again(&costs, &alone, &earliest, &headways, &mut again);
-        pooling.minimise(&costs, &alone, &earliest, &headways, &mut times);
+        let program = Program { costs: &costs, alone_s: &alone, earliest_s: &earliest, headways: &headways };
+        pooling.minimise(&Program { headways: &changed, ..program }, &mut again);
+        pooling.minimise_again(&program, &mut again);
+        pooling.minimise(&program, &mut times);
         prop_assert!(keeps(&again, &earliest, &headways), "{again:?}");
         let value = |times: &[f64]| times.iter().zip(&costs).map(|(t, c)| c.value(*t)).sum::<f64>();
         let (cold, warm) = (value(&times), value(&again));
@@ -286,7 +290,9 @@ proptest! {
         let mut earliest = vec![0.0; costs.len()];
         earliest[0] = held_s;
         let mut times = Vec::new();
-        Pooling::default().minimise(&costs, &alone_s(&costs), &earliest, &headways, &mut times);
+        let program =
+            Program { costs: &costs, alone_s: &alone_s(&costs), earliest_s: &earliest, headways: &headways };
+        Pooling::default().minimise(&program, &mut times);
         prop_assert!(keeps(&times, &earliest, &headways));
         let mut behind = 0.0;
         for i in (0..costs.len()).rev() {
@@ -314,7 +320,9 @@ proptest! {
     ) {
         let costs: Vec<Cost> = vehicles.iter().map(|single| Cost::Single(*single)).collect();
         let mut times = Vec::new();
-        Pooling::default().minimise(&costs, &alone_s(&costs), &[0.0; 3], &gaps, &mut times);
+        let program =
+            Program { costs: &costs, alone_s: &alone_s(&costs), earliest_s: &[0.0; 3], headways: &gaps };
+        Pooling::default().minimise(&program, &mut times);
         prop_assert!(keeps(&times, &[0.0; 3], &gaps));
         let value = |times: &[f64]| times.iter().zip(&costs).map(|(t, c)| c.value(*t)).sum::<f64>();
         let own = value(&times);

@@ -1,7 +1,7 @@
 //! From a zone's duties to headways, and to the instants at which its vehicles leave.
 
 use super::cost::Cost;
-use super::pooling::{Headway, Pooling, best_s};
+use super::pooling::{Headway, Pooling, Program, best_s};
 use crate::conflict::{Duties, Duty, DutyKind};
 
 /// Speeds that divide are taken to be at least this, m/s.
@@ -90,10 +90,11 @@ impl Chain {
             self.speeds_mps.extend(costs.iter().zip(own).zip(times).map(|((c, p), &t)| speed(c, p, t)));
             self.separate(passages, duties, known);
             let Chain { pooling, headways, alone_s, earliest_s, before_s, times_s, .. } = self;
+            let program = Program { costs, alone_s, earliest_s, headways };
             if round == 0 {
-                pooling.minimise(costs, alone_s, earliest_s, headways, times_s);
+                pooling.minimise(&program, times_s);
             } else {
-                pooling.minimise_again(costs, alone_s, earliest_s, headways, times_s);
+                pooling.minimise_again(&program, times_s);
             }
             // From the same instants the same would come out again.
             if times_s == before_s {

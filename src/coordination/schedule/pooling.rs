@@ -69,25 +69,23 @@ struct Whole {
     earliest: (f64, u32),
 }
 
-/// A program.
-struct Program<'a, C> {
-    costs: &'a [C],
-    earliest_s: &'a [f64],
-    headways: &'a [Headway],
+/// What is to be minimised.
+#[derive(Clone, Copy, Debug)]
+pub struct Program<'a, C> {
+    /// Cost of each vehicle, in passing order.
+    pub costs: &'a [C],
+    /// The [best instant](best_s) of each alone, s.
+    pub alone_s: &'a [f64],
+    /// Nobody is earlier than this, s.
+    pub earliest_s: &'a [f64],
+    /// Sorted by `after`.
+    pub headways: &'a [Headway],
 }
 
 impl Pooling {
-    /// Writes the best instants to `times_s`. `alone_s` are the [best instants](best_s) of each alone. Nobody is earlier
-    /// than its `earliest_s`. `headways` are sorted by `after`.
-    pub fn minimise<C: Convex>(
-        &mut self,
-        costs: &[C],
-        alone_s: &[f64],
-        earliest_s: &[f64],
-        headways: &[Headway],
-        times_s: &mut Vec<f64>,
-    ) {
-        let program = Program { costs, earliest_s, headways };
+    /// Writes the best instants to `times_s`.
+    pub fn minimise<C: Convex>(&mut self, program: &Program<'_, C>, times_s: &mut Vec<f64>) {
+        let Program { costs, alone_s, earliest_s, headways } = *program;
         let count = costs.len();
         self.block.clear();
         self.block.extend(0..count as u32);
@@ -100,48 +98,41 @@ impl Pooling {
         for (i, alone_s) in alone_s.iter().enumerate() {
             self.at_s.push(alone_s.max(earliest_s[i]));
             ready += headways[ready..].iter().take_while(|h| h.after as usize == i).count();
-            self.merge(&program, ready, i as u32, Side::Before);
+            self.merge(program, ready, i as u32, Side::Before);
         }
         if !is_chain(headways) {
-            self.split_where_it_pays(&program);
+            self.split_where_it_pays(program);
         }
-        self.finish(&program, times_s);
+        self.finish(program, times_s);
     }
 
     /// The same, begun from the blocks of the program solved last where this one has headways between the same
     /// vehicles: for those that differ little.
-    pub fn minimise_again<C: Convex>(
-        &mut self,
-        costs: &[C],
-        alone_s: &[f64],
-        earliest_s: &[f64],
-        headways: &[Headway],
-        times_s: &mut Vec<f64>,
-    ) {
+    pub fn minimise_again<C: Convex>(&mut self, program: &Program<'_, C>, times_s: &mut Vec<f64>) {
+        let headways = program.headways;
         let between = |h: &Headway| (h.before, h.after);
-        if costs.len() != self.block.len() || !headways.iter().map(between).eq(self.last.iter().map(between))
-        {
-            return self.minimise(costs, alone_s, earliest_s, headways, times_s);
+        let is_alike = headways.iter().map(between).eq(self.last.iter().map(between));
+        if program.costs.len() != self.block.len() || !is_alike {
+            return self.minimise(program, times_s);
         }
-        let program = Program { costs, earliest_s, headways };
-        self.place_blocks_again(&program, alone_s);
+        self.place_blocks_again(program);
         let all = headways.len();
         let apart = |own: &Pooling, h: &Headway| own.block[h.before as usize] != own.block[h.after as usize];
         while let Some(h) = headways.iter().find(|h| apart(self, h) && self.lack_s(h) > TOLERANCE_S) {
             // Each merge makes one block of two.
             let block = self.block[h.after as usize];
-            self.merge(&program, all, block, Side::Before);
+            self.merge(program, all, block, Side::Before);
         }
-        self.split_where_it_pays(&program);
+        self.split_where_it_pays(program);
         // Blocks that were not merged in passing order may lack headways within.
         if headways.iter().any(|h| self.lack_s(h) > WITHIN_TOLERANCE_S) {
-            return self.minimise(costs, alone_s, earliest_s, headways, times_s);
+            return self.minimise(program, times_s);
         }
-        self.finish(&program, times_s);
+        self.finish(program, times_s);
     }
 
     /// Moves the blocks there are, whose headways have changed, to their best instants.
-    fn place_blocks_again<C: Convex>(&mut self, program: &Program<'_, C>, alone_s: &[f64]) {
+    fn place_blocks_again<C: Convex>(&mut self, program: &Program<'_, C>) {
         self.old_s.clear();
         self.old_s
             .extend((0..self.block.len()).map(|i| self.at_s[self.block[i] as usize] + self.offset_s[i]));
@@ -154,7 +145,7 @@ impl Pooling {
         }
         for block in 0..self.block.len() as u32 {
             if self.block[block as usize] == block {
-                let own = self.members(block).map(|i| alone_s[i] - self.offset_s[i]);
+                let own = self.members(block).map(|i| program.alone_s[i] - self.offset_s[i]);
                 let (from, to) =
                     own.fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), s| (a.min(s), b.max(s)));
                 self.place(program, block, self.at_s[block as usize], from, to);
