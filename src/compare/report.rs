@@ -146,7 +146,7 @@ impl Block {
             }
         };
         for (at, measure) in MEASURES.iter().enumerate() {
-            row(measure.name.to_owned(), measure.decimals, &|p| p.measures.get(measure.id).cloned());
+            row(measure.label(), measure.decimals, &|p| p.measures.get(measure.id).cloned());
             if at > 0 {
                 continue;
             }

@@ -25,8 +25,7 @@ pub fn table() -> Table {
         column("vehicles", Type::Count, None, "Vehicles that got through."),
     ];
     for measure in measures() {
-        let meaning = measure.name.replace(", all runs", "");
-        columns.push(column(measure.id, Type::Number, measure.unit(), &meaning));
+        columns.push(column(measure.id, Type::Number, measure.unit, measure.name));
     }
     columns.push(column("failure", Type::Text, None, "Why there is no outcome; absent where there is one."));
     Table { name: "sweep", columns }
