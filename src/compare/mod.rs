@@ -138,10 +138,11 @@ impl Performed<'_> {
             let (seed, sets) = key;
             let scenario = load(argument, *seed, sets)
                 .map_err(|source| CompareError::Scenario { name: name.clone(), source: Box::new(source) })?;
-            let sample = match scenario.plugins.is_empty() {
-                true => self.means.cache.sample(&scenario, name)?,
+            let sample = if scenario.plugins.is_empty() {
+                self.means.cache.sample(&scenario, name)?
+            } else {
                 // What other programs have to do with it may change with them, so it is not kept.
-                false => processes::sample(argument, *seed, sets, name)?,
+                processes::sample(argument, *seed, sets, name)?
             };
             Ok((scenario, sample))
         };

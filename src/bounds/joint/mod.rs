@@ -4,7 +4,7 @@
 //! driven exactly, and instants follow from speeds. Cost is the sum of the zones' mean costs. Toward the vehicle
 //! ahead on the same path, at each place, and toward the one that passes a merge before it, at its own passing, a
 //! vehicle keeps `phi v + delta`, as instants: it is nowhere before the other was that far ahead. A vehicle that comes
-//! in closer than that may stay closer for a while, by as much as decays at a rate, the least of `RECOVERIES` at which it is
+//! in closer than that may stay closer for a while, by as much as decays at a rate, the least of some rates at which it is
 //! not more exposed than what it is compared with.
 //!
 //! Cost is nearly convex in the speeds, instants are not: a sequence of quadratic programs (`program`), each
@@ -19,9 +19,10 @@ use program::{Step, step};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// Rates at which missing distance must be made up: so many, 1/s, the first, and how much each is above the one before.
+/// Rates at which missing distance must be made up: how many, the slowest, 1/s, and how far they are apart, 1/s.
 const RECOVERIES: usize = 32;
-const RECOVERIES_PER_S: (f64, f64) = (0.6, 0.05);
+const SLOWEST_RECOVERY_PER_S: f64 = 0.6;
+const RECOVERY_STEP_PER_S: f64 = 0.05;
 /// Exposure is integrated by trapezoids, so many to a stretch.
 const PARTS: usize = 8;
 /// Length of the stretches of constant acceleration, about, m.
@@ -113,7 +114,8 @@ pub(super) struct Problem {
 /// Who may stay too close for longer has less to do: the optimum is that of the least recovery at which its exposure, per
 /// vehicle and over all zones, is at most `most_exposure_ms`, m s, or else that of the greatest.
 pub fn seek(traffic: &Traffic<'_>, courses: &[Vec<Course>], most_exposure_ms: f64) -> Option<Found> {
-    let at = |rate: usize| seek_at(traffic, courses, RECOVERIES_PER_S.0 + RECOVERIES_PER_S.1 * rate as f64);
+    let recovery_per_s = |rate: usize| SLOWEST_RECOVERY_PER_S + RECOVERY_STEP_PER_S * rate as f64;
+    let at = |rate: usize| seek_at(traffic, courses, recovery_per_s(rate));
     // The faster it is made up for, the less exposed.
     let (mut slow, mut fast) = (0, RECOVERIES - 1);
     let mut found = None;
