@@ -34,6 +34,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from ._features import FEATURES
 from ._session import Error
 
 if typing.TYPE_CHECKING:
@@ -105,6 +106,9 @@ class _Runs:
         described = self._library.cz_env_describe(self._handle)
         self.about: dict[str, typing.Any] = json.loads(ctypes.string_at(described))
         self._library.cz_env_forget(described)
+        # What is trained here drives by `control_zones.features`.
+        if self.about["features"] != list(FEATURES):
+            raise Error(f"{self.about['features']} are the library's features, expected those of this package: {FEATURES}")
         self.zones: list[str] = self.about["zones"]
         rows = (count, len(self.zones), capacity)
         self.count = count
@@ -172,6 +176,22 @@ class _Runs:
         self.close()
 
 
+def _runs_of_a_zone(
+    scenario: str | None,
+    zone: str | None,
+    sets: Mapping[str, object] | Iterable[str],
+    shield: str | None,
+    capacity: int,
+    count: int,
+) -> tuple[_Runs, str]:
+    """Runs of which one zone is driven from outside, the first unless it is named; and its name."""
+    if zone is None:
+        all_zones = _Runs(scenario, (), sets, shield, 1, 1)
+        zone = all_zones.zones[0]
+        all_zones.close()
+    return _Runs(scenario, (zone,), sets, shield, capacity, count), zone
+
+
 def _drawn(random: numpy.random.Generator) -> int:
     """The seed of an episode that was given none."""
     return int(random.integers(2**31))
@@ -202,12 +222,7 @@ class ZoneEnv(gymnasium.Env[Floats, Floats]):
         shield: str | None = None,
         capacity: int = CAPACITY,
     ) -> None:
-        if zone is None:
-            first = _Runs(scenario, (), sets, shield, 1, 1)
-            zone = first.zones[0]
-            first.close()
-        self._runs = _Runs(scenario, (zone,), sets, shield, capacity, 1)
-        self.zone = zone
+        self._runs, self.zone = _runs_of_a_zone(scenario, zone, sets, shield, capacity, 1)
         self.features: list[str] = self._runs.about["features"]
         self.action_space = self._runs.action_space()
         self.observation_space = self._runs.observation_space()
@@ -266,13 +281,8 @@ class ZoneVectorEnv(VectorEnv[Floats, Floats, Floats]):
         shield: str | None = None,
         capacity: int = CAPACITY,
     ) -> None:
-        if zone is None:
-            first = _Runs(scenario, (), sets, shield, 1, 1)
-            zone = first.zones[0]
-            first.close()
-        self._runs = _Runs(scenario, (zone,), sets, shield, capacity, num_envs)
+        self._runs, self.zone = _runs_of_a_zone(scenario, zone, sets, shield, capacity, num_envs)
         self.num_envs = num_envs
-        self.zone = zone
         self.features: list[str] = self._runs.about["features"]
         self.single_action_space = self._runs.action_space()
         self.single_observation_space = self._runs.observation_space()
