@@ -170,9 +170,7 @@ impl Run {
         let step = self.world.step();
         let failed = |fault: String| RunError::Roles { step, fault };
         self.world.command(0, &self.commands).map_err(|fault| failed(fault.to_string()))?;
-        self.world
-            .advance()
-            .map_err(|vehicles| failed(format!("{vehicles} vehicles were commanded by nobody")))?;
+        self.world.advance().map_err(|error| failed(error.to_string()))?;
         for ((zone, cost), reward) in self.zones.iter().zip(&mut self.cost).zip(rewards) {
             let now = self.world.zone_cost(*zone);
             *reward = *cost - now;

@@ -51,12 +51,13 @@ pub(super) fn run_as(
         run_id: new_run_id(),
         resume: None,
         trace: None,
+        world: None,
     };
     let words = |e: AppError| e.to_string();
     let recording = match record {
         Some(path) => {
             let loaded = scenario.load().map_err(|e| e.to_string())?;
-            Some(Recording::start(path, scenario, &loaded, plan.share, plan.run_id).map_err(words)?)
+            Some(Recording::start(path, scenario, &loaded, plan.share, plan.run_id, None).map_err(words)?)
         }
         None => None,
     };

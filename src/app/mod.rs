@@ -34,6 +34,7 @@ use crate::reproduce::{self, ReproduceError};
 use crate::scenario::ScenarioError;
 use crate::scenario::load::printable;
 use crate::transport::iox::SpaceError;
+use crate::world::Traffic;
 use clap::Parser;
 pub use record::open as open_recording;
 use std::process::ExitCode;
@@ -134,8 +135,8 @@ pub fn cz() -> ExitCode {
     finish(
         "cz",
         match args.command {
-            args::Command::Run(args) => run::run(&args),
-            args::Command::World(args) => parts::world(&args),
+            args::Command::Run(args) => run::run(&args, None),
+            args::Command::World(args) => parts::world(&args, None),
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
             args::Command::Keep(args) => supervise::keep(&args),
@@ -164,7 +165,28 @@ pub fn cz() -> ExitCode {
 pub fn cz_world() -> ExitCode {
     say_panics_in_a_line("cz-world");
     raise_file_limit();
-    finish("cz-world", parts::world(&args::Standalone::<args::WorldArgs>::parse().args))
+    finish("cz-world", parts::world(&args::Standalone::<args::WorldArgs>::parse().args, None))
+}
+
+/// `cz run --in-process` or `cz world` with a traffic in place of the world's own motion; `arguments` are what stands behind
+/// the program's name. Returns the exit code.
+pub fn played(arguments: &[String], traffic: Box<dyn Traffic>) -> u8 {
+    raise_file_limit();
+    let name = traffic.name();
+    let own = std::iter::once(name.as_str()).chain(arguments.iter().map(String::as_str));
+    let args = match args::Cz::try_parse_from(own) {
+        Ok(args) => args,
+        Err(error) => {
+            let _ = error.print();
+            return error.exit_code() as u8;
+        }
+    };
+    let result = match args.command {
+        args::Command::Run(args) if args.in_process => run::run(&args, Some(traffic)),
+        args::Command::World(args) => parts::world(&args, Some(traffic)),
+        _ => Err(AppError::Usage("expected `run --in-process` or `world`, with their arguments".to_owned())),
+    };
+    exit_code(&name, result)
 }
 
 /// `cz-coord`, the same as `cz coord`.
@@ -197,11 +219,15 @@ fn raise_file_limit() {
 }
 
 fn finish(program: &str, result: Result<(), AppError>) -> ExitCode {
+    ExitCode::from(exit_code(program, result))
+}
+
+fn exit_code(program: &str, result: Result<(), AppError>) -> u8 {
     match result {
-        Ok(()) => ExitCode::SUCCESS,
+        Ok(()) => 0,
         Err(error) => {
             say::say(format_args!("{program}: {}", error.words()));
-            ExitCode::from(error.exit_code())
+            error.exit_code()
         }
     }
 }

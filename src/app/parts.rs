@@ -14,7 +14,7 @@ use crate::process::{
 use crate::scenario::scenario_hash;
 use crate::trace::Tracing;
 use crate::transport::iox::RunName;
-use crate::world::World;
+use crate::world::{Traffic, World};
 use ipc_schemas::Role;
 use std::io::Write;
 use std::sync::Arc;
@@ -23,7 +23,7 @@ use std::time::{Duration, Instant};
 /// Time between two progress reports to the supervisor.
 const REPORT_EVERY: Duration = Duration::from_millis(50);
 
-pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
+pub(super) fn world(args: &WorldArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(), AppError> {
     let _tracing = Tracing::begin("world");
     let resume = args.resume.as_deref().map(record::open).transpose()?;
     let (scenario, share) = match &resume {
@@ -33,18 +33,27 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     share.check(&scenario)?;
     let stop = StopFlag::from_signals()?;
     follow_supervisor(args.supervised)?;
+    if let (Some(traffic), Some(from)) = (&traffic, &args.resume) {
+        let problem = format!(
+            "--resume {}: {} moves the vehicles and cannot go on from there",
+            from.display(),
+            traffic.name()
+        );
+        return Err(AppError::Usage(problem));
+    }
     let run_id = args.run_id.unwrap_or_else(new_run_id);
     let past = resume
         .as_ref()
         .map(|reader| (reader, args.resume_steps.unwrap_or_else(|| first_missing_step(reader))));
     report::check_json(args.json.as_deref())?;
+    let played_by = traffic.as_ref().map(|traffic| traffic.name());
     let observation = match &args.record {
         Some(path) => {
             let recording = match (past, &args.resume) {
                 (Some((reader, steps)), Some(from)) => {
                     Recording::continuation(path, reader, from, steps, run_id)?
                 }
-                _ => Recording::start(path, &args.scenario, &scenario, share, run_id)?,
+                _ => Recording::start(path, &args.scenario, &scenario, share, run_id, played_by)?,
             };
             let recording = recording.lagging(args.conduct.record_lag());
             let push = |r: &mut Recording, step, block: &[u8]| r.push_block(step, block);
@@ -71,17 +80,19 @@ pub(super) fn world(args: &WorldArgs) -> Result<(), AppError> {
     let settling = settling(&args.conduct.wait, &*tell);
     if args.supervised.is_some() {
         let mut last = Instant::now();
-        let (outcome, departure) = run_world(&scenario, &options, past, &settling, &stop, |world| {
+        let progress = |world: &World| {
             if last.elapsed() >= REPORT_EVERY {
                 last = Instant::now();
                 tell_supervisor(&WorldLine::progress(world));
             }
-        })?;
+        };
+        let run = run_world(&scenario, &options, past, traffic, &settling, &stop, progress);
+        let (outcome, departure) = run?;
         tell_supervisor(&WorldLine::Outcome(Box::new(outcome)));
         leave(departure, &options, &stop);
         return Ok(());
     }
-    let run = run_world(&scenario, &options, past, &settling, &stop, |_: &World| {});
+    let run = run_world(&scenario, &options, past, traffic, &settling, &stop, |_: &World| {});
     let (outcome, departure) = match run {
         Ok((outcome, departure)) => (Ok(outcome), Some(departure)),
         Err(error) => (Err(AppError::from(error)), None),

@@ -44,6 +44,7 @@ impl Recording {
         scenario: &Scenario,
         share: ShareArgs,
         run_id: u64,
+        played_by: Option<String>,
     ) -> Result<Recording, AppError> {
         // A generated network has no text.
         let text = match arguments.side_by_side {
@@ -53,7 +54,7 @@ impl Recording {
         let source = ScenarioSource { text, overrides: arguments.set.clone() };
         let controllers = scenario.controllers(share.ctrl_procs);
         let processes = Processes { coordinators: share.coord_procs, controllers };
-        let metadata = Metadata::new(scenario, source, run_id, processes);
+        let metadata = Metadata { played_by, ..Metadata::new(scenario, source, run_id, processes) };
         Ok(Recording::of(Recorder::create(path, &metadata)?, path))
     }
 

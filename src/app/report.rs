@@ -5,7 +5,7 @@ use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
 use crate::process::{LatencyBin, LatencyUs, Outcome, Punctuality, Replacement, Settled};
 use crate::scenario::{Demand, Road, Scenario, ShieldMode};
-use crate::world::{FaultCounts, OverlapSummary, ShieldSummary, Stall, ZoneSummaryRow};
+use crate::world::{FaultCounts, OverlapSummary, ShieldSummary, Stall, TrafficSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
 use serde::Serialize;
 use std::path::Path;
@@ -37,6 +37,8 @@ pub(super) struct Summary {
     shield: ShieldSummary,
     #[serde(skip_serializing_if = "Option::is_none")]
     faults: Option<FaultCounts>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    traffic: Option<TrafficSummary>,
     replacements: Vec<Replacement>,
     refused: Vec<RefusedFrames>,
     late_frames: u64,
@@ -101,6 +103,7 @@ impl Summary {
             stalled: world.stalled,
             shield: world.shield,
             faults: world.faults,
+            traffic: world.traffic,
             replacements: outcome.replacements,
             refused: outcome.refused,
             late_frames: outcome.late_frames,
@@ -263,6 +266,17 @@ impl Summary {
                 f.records_noisy,
                 f.records_biased,
                 f.records_frozen
+            ));
+        }
+        if let Some(t) = &self.traffic {
+            text.push_str(&format!(
+                "moved by {}: accelerations within {:.3} m/s² of what was to be held, positions within {:.4} m of the mean \
+                 acceleration's; {} commanded by nobody, {} taken out within a zone\n",
+                t.name,
+                t.greatest_disobedience_mps2,
+                t.greatest_deviation_m,
+                number(t.uncommanded.into(), "vehicle"),
+                t.gone
             ));
         }
         if let Some(p) = &self.punctuality {

@@ -54,6 +54,7 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         run_id: new_run_id(),
         resume: Some((&args.file, first)),
         trace: None,
+        world: None,
     };
     let lag = args.supervised.conduct.record_lag();
     let recording = match &args.record {

@@ -7,13 +7,15 @@ use super::report::{Summary, Transport};
 use super::supervise::{Plan, conduct};
 use super::{AppError, controllers, report, sibling};
 use crate::lockstep::in_process::InProcess;
-use crate::process::{StopFlag, WaitMode, check_cores, new_run_id, run_in_process, run_in_process_observed};
+use crate::process::{
+    StopFlag, WaitMode, check_cores, new_run_id, run_on_in_process, run_on_in_process_observed,
+};
 use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
-use crate::world::World;
+use crate::world::{Traffic, World};
 use std::sync::Arc;
 
-pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
+pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(), AppError> {
     if args.view {
         // It starts this run itself, without the flag.
         let own = std::env::args_os().skip(2).filter(|argument| argument != "--view");
@@ -41,7 +43,7 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
     }
     let bar = Bar::new(&scenario);
     if args.in_process {
-        return run_here(args, &arguments, &scenario, &bar);
+        return run_here(args, &arguments, &scenario, traffic, &bar);
     }
     let processes = 1 + args.share.coord_procs + scenario.controllers(args.share.ctrl_procs);
     let plan = Plan {
@@ -54,10 +56,12 @@ pub(super) fn run(args: &RunArgs) -> Result<(), AppError> {
         run_id: new_run_id(),
         resume: None,
         trace: args.trace.as_deref(),
+        world: args.world.as_deref(),
     };
     let recording = match &args.record {
         Some(path) => {
-            let recording = Recording::start(path, &arguments, &scenario, args.share, plan.run_id)?;
+            let recording =
+                Recording::start(path, &arguments, &scenario, args.share, plan.run_id, args.world.clone())?;
             Some(recording.lagging(args.supervised.conduct.record_lag()))
         }
         None => None,
@@ -74,6 +78,7 @@ fn run_here(
     args: &RunArgs,
     arguments: &ScenarioArgs,
     scenario: &Arc<Scenario>,
+    traffic: Option<Box<dyn Traffic>>,
     bar: &Bar,
 ) -> Result<(), AppError> {
     let stop = StopFlag::from_signals()?;
@@ -81,16 +86,21 @@ fn run_here(
     let (coordinators, controllers) = (shares.coord_procs, shares.ctrl_procs);
     let progress = |world: &World| bar.show(Position::of(world));
     let mut recording = match &args.record {
-        Some(path) => Some(Recording::start(path, arguments, scenario, shares, InProcess::RUN_ID)?),
+        Some(path) => {
+            let played_by = traffic.as_ref().map(|traffic| traffic.name());
+            Some(Recording::start(path, arguments, scenario, shares, InProcess::RUN_ID, played_by)?)
+        }
         None => None,
     };
+    let observed = recording.is_some();
+    let run = match traffic {
+        Some(traffic) => InProcess::played(scenario, coordinators, controllers, traffic, observed),
+        None if observed => InProcess::observed(scenario, coordinators, controllers),
+        None => InProcess::new(scenario, coordinators, controllers),
+    };
     let outcome = match &mut recording {
-        None => run_in_process(scenario, coordinators, controllers, &stop, progress),
-        Some(recording) => {
-            run_in_process_observed(scenario, coordinators, controllers, &stop, progress, |f| {
-                recording.push(f);
-            })
-        }
+        None => run_on_in_process(run, &stop, progress),
+        Some(recording) => run_on_in_process_observed(run, &stop, progress, |f| recording.push(f)),
     };
     let outcome = outcome.map_err(AppError::from);
     bar.finish();

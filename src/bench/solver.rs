@@ -252,7 +252,7 @@ fn record(scenario: &Arc<Scenario>) -> Result<Vec<Step>, BenchError> {
         pool.coordinate(&states, &assignments).map_err(|e| broken(&e.to_string()))?;
         pool.command(time_s, &states, |c| commands.push(c)).map_err(|e| broken(&e.to_string()))?;
         world.command(0, &commands).map_err(|e| broken(&e.to_string()))?;
-        world.advance().map_err(|n| broken(&format!("{n} vehicles without a command")))?;
+        world.advance().map_err(|error| broken(&error.to_string()))?;
         steps.push(Step { time_s, states, assignments });
     }
     if steps.is_empty() {

@@ -11,7 +11,7 @@ use crate::scenario::share::{neighbour_coordinators, zones_of};
 use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::memory::{MemoryFrame, MemoryInbox, MemoryOutbox, MemoryService};
 use crate::transport::{Frame, Inbox};
-use crate::world::World;
+use crate::world::{Traffic, World};
 use ipc_schemas::{Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
 use std::sync::Arc;
 
@@ -88,6 +88,18 @@ impl InProcess {
     /// The same, and [`frames`](Self::frames) must be asked for after each step.
     pub fn observed(scenario: &Arc<Scenario>, coordinators: u32, controllers: u32) -> InProcess {
         InProcess::build(World::new(InProcess::own(scenario), coordinators), coordinators, controllers, true)
+    }
+
+    /// The same of a world whose vehicles a traffic moves; `observed` as above.
+    pub fn played(
+        scenario: &Arc<Scenario>,
+        coordinators: u32,
+        controllers: u32,
+        traffic: Box<dyn Traffic>,
+        observed: bool,
+    ) -> InProcess {
+        let world = World::played(InProcess::own(scenario), coordinators, traffic);
+        InProcess::build(world, coordinators, controllers, observed)
     }
 
     fn build(world: World, coordinators: u32, controllers: u32, observed: bool) -> InProcess {

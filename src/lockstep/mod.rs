@@ -24,6 +24,7 @@ use crate::control::pool::PoolError;
 use crate::scenario::ControllerNames;
 use crate::step::StepFrames;
 use crate::transport::{Frame, TransportError};
+use crate::world::AdvanceError;
 use ipc_schemas::{FrameHeader, HeaderFault, Role, VehicleState};
 
 /// What a driver did.
@@ -117,13 +118,13 @@ pub enum LockstepError {
         /// What is wrong.
         fault: HeaderFault,
     },
-    /// All controllers answered but some vehicles have no command.
-    #[error("step {step}: {vehicles} vehicles were commanded by nobody")]
-    Uncommanded {
+    /// The world cannot go on, although all have answered.
+    #[error("step {step}: {error}")]
+    World {
         /// Step.
         step: u64,
-        /// Their number.
-        vehicles: usize,
+        /// Why.
+        error: AdvanceError,
     },
     /// State and coordination frames contradict each other.
     #[error("step {step}: {fault}")]

@@ -430,7 +430,7 @@ where
         let step = self.world.step();
         self.show(self.controllers.len())?;
         self.kept.end(&self.controllers, self.put_in, self.put_in_verdict);
-        self.world.advance().map_err(|vehicles| LockstepError::Uncommanded { step, vehicles })?;
+        self.world.advance().map_err(|error| LockstepError::World { step, error })?;
         if let Some(ledger) = &mut self.ledger {
             ledger.end();
         }

@@ -36,7 +36,7 @@ pub use viewing::{Notice, Place, Steering, Watched};
 pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
     Departure, WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process,
-    run_in_process_observed, run_on_in_process, run_world,
+    run_in_process_observed, run_on_in_process, run_on_in_process_observed, run_world,
 };
 
 use crate::lockstep::LockstepError;

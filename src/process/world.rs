@@ -18,7 +18,7 @@ use crate::scenario::Scenario;
 use crate::step::StepFrames;
 use crate::trace::{self, Phase};
 use crate::transport::iox::{RunName, RunSpace, SpaceError};
-use crate::world::World;
+use crate::world::{Traffic, World};
 use ipc_schemas::Role;
 use std::sync::Arc;
 use std::time::Duration;
@@ -121,20 +121,23 @@ impl Departure {
 }
 
 /// Runs the world of a multi-process run to its end, on from so many steps of a recording if there is one;
-/// `progress` is called now and then. Once the outcome has been put where it belongs, the departure is to be
+/// `progress` is called now and then. With a `traffic`, that one moves the vehicles; such a run does not go on from a
+/// recording. Once the outcome has been put where it belongs, the departure is to be
 /// waited for.
 pub fn run_world(
     scenario: &Arc<Scenario>,
     options: &WorldOptions,
     resume: Option<(&Reader<FileSource>, u64)>,
+    traffic: Option<Box<dyn Traffic>>,
     settling: &Settling<'_>,
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
 ) -> Result<(Outcome, Departure), ProcessError> {
     // First of all: it may take a while, and may fail.
-    let world = match resume {
-        Some((reader, steps)) => replay_world(reader, steps)?,
-        None => World::new(scenario.clone(), options.coordinators),
+    let world = match (resume, traffic) {
+        (Some((reader, steps)), _) => replay_world(reader, steps)?,
+        (None, Some(traffic)) => World::played(scenario.clone(), options.coordinators, traffic),
+        (None, None) => World::new(scenario.clone(), options.coordinators),
     };
     let first_step = world.step();
     let mut ledger =
@@ -296,8 +299,7 @@ pub fn run_in_process(
     stop: &StopFlag,
     progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
-    let mut run = InProcess::new(scenario, coordinators, controllers);
-    drive(&mut run, stop, progress, |_| {})
+    run_on_in_process(InProcess::new(scenario, coordinators, controllers), stop, progress)
 }
 
 /// The same, and shows the frames of every step.
@@ -309,17 +311,31 @@ pub fn run_in_process_observed(
     progress: impl FnMut(&World),
     observe: impl FnMut(&StepFrames<'_>),
 ) -> Result<Outcome, ProcessError> {
-    let mut run = InProcess::observed(scenario, coordinators, controllers);
-    drive(&mut run, stop, progress, observe)
+    run_on_in_process_observed(
+        InProcess::observed(scenario, coordinators, controllers),
+        stop,
+        progress,
+        observe,
+    )
 }
 
-/// Runs one that goes on from a recording to its end.
+/// Runs one that has been begun to its end.
 pub fn run_on_in_process(
     mut run: InProcess,
     stop: &StopFlag,
     progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
     drive(&mut run, stop, progress, |_| {})
+}
+
+/// The same of one that is observed, and shows the frames of every step.
+pub fn run_on_in_process_observed(
+    mut run: InProcess,
+    stop: &StopFlag,
+    progress: impl FnMut(&World),
+    observe: impl FnMut(&StepFrames<'_>),
+) -> Result<Outcome, ProcessError> {
+    drive(&mut run, stop, progress, observe)
 }
 
 fn drive(

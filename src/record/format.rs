@@ -183,6 +183,9 @@ pub struct Metadata {
     pub controllers: u32,
     /// When the run began, s since 1970.
     pub created_unix_s: u64,
+    /// Who moved the vehicles, where it was not the world itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub played_by: Option<String>,
 }
 
 /// What a program was built from, and how.
@@ -249,6 +252,7 @@ impl Metadata {
             controllers: processes.controllers,
             build: Build::own(),
             created_unix_s: now.map_or(0, |t| t.as_secs()),
+            played_by: None,
         }
     }
 }

@@ -23,6 +23,10 @@ pub(super) struct Car {
     pub hop: u16,
     /// Kind of vehicle: index in the scenario's fleet.
     pub kind: u16,
+    /// Whether it does what it is commanded; otherwise somebody else drives it.
+    pub is_commanded: bool,
+    /// It has been taken out where it was: nobody knows anything of it any more.
+    pub is_gone: bool,
     /// Of a vehicle that has left the zone: the last zone and exit by which it is known to have left since, and
     /// the exit it will leave the next one by.
     pub beyond: Beyond,
@@ -115,6 +119,8 @@ impl Car {
             road: way.road,
             hop: way.hop,
             kind,
+            is_commanded: true,
+            is_gone: false,
             beyond: Beyond::default(),
             owed: (0, 0),
             x_m: 0.0,

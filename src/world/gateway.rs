@@ -381,6 +381,9 @@ impl World {
             faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, |z| zones[z].first());
         }
         let shields = self.gateway.mode != ShieldMode::Off || self.gateway.falls_back;
+        if self.played.is_some() {
+            self.distrust();
+        }
         for zone in (0..self.zones.len()).rev() {
             if self.links.cars > 0 {
                 self.links.range(zone as u32).for_each(|link| self.drive_link(scenario, zone, link, dt_s));
@@ -395,6 +398,16 @@ impl World {
             self.cars[zone as usize][at].command_mps2 = self.followed(scenario, zone as usize, at).u_mps2;
         }
         self.gateway.falls_back = false;
+    }
+
+    /// Whoever is not commanded may brake fully, for all that is known.
+    fn distrust(&mut self) {
+        for zone in 0..self.zones.len() {
+            let first = self.zones[zone].first();
+            for car in self.cars[zone][first..].iter_mut().filter(|car| !car.is_commanded) {
+                car.command_mps2 = self.kinds[usize::from(car.kind)].u_min_mps2;
+            }
+        }
     }
 
     /// Those that have left a zone move with the vehicles they stand for. With `settling`, what is not settled yet
@@ -458,7 +471,7 @@ impl World {
         for &at in &self.order[zone] {
             let car = cars[at as usize];
             let falls_back = car.visit.verdict == frames::VERDICT_FALLBACK;
-            if *mode == ShieldMode::Off && !falls_back {
+            if (*mode == ShieldMode::Off && !falls_back) || !car.is_commanded {
                 continue;
             }
             let shield = &shields[usize::from(car.kind)];

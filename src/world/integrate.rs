@@ -6,6 +6,7 @@ use super::link::{Link, LinkCar};
 use super::metrics::CompletedVisit;
 use super::owed::{Owed, Standing};
 use super::role::{Scratch, World};
+use super::traffic::{Admitted, AdvanceError};
 use super::way::Ways;
 use crate::conflict::DutyKind;
 use crate::lists::AHEAD;
@@ -16,8 +17,8 @@ use ipc_schemas::{VERDICT_FE, VERDICT_INFEASIBLE};
 /// A vehicle about to enter a zone at the end of the step.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Entry {
-    zone: ZoneId,
-    car: Car,
+    pub zone: ZoneId,
+    pub car: Car,
 }
 
 /// The vehicle a newcomer on a road has ahead of it, if there is one, as it moves over the step.
@@ -30,7 +31,7 @@ pub(super) struct Leader {
 
 impl World {
     /// Integrates from the present step to the next with the commands in force.
-    pub(super) fn integrate(&mut self) {
+    pub(super) fn integrate(&mut self) -> Result<(), AdvanceError> {
         let scenario = self.scenario.clone();
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
@@ -39,13 +40,18 @@ impl World {
         // as its turn comes: what is downstream of it has not moved yet.
         let alone =
             self.links.cars == 0 && self.gateway.is_off() && self.faults.is_none() && !self.closes_a_circle;
+        let alone = alone && self.played.is_none();
         if !alone {
             self.hold_all(&scenario, dt_s);
         }
+        self.follow_traffic(dt_s)?;
         self.scratch.entries.clear();
         self.scratch.leaders.clear();
         self.events.clear();
-        self.gates.advance(&scenario.network.roads, scenario.time_s(self.step + 1));
+        let is_brought = self.played.as_ref().is_some_and(|played| played.brings());
+        if !is_brought {
+            self.gates.advance(&scenario.network.roads, scenario.time_s(self.step + 1));
+        }
         for link in 0..if self.links.cars > 0 { self.links.all.len() } else { 0 } {
             self.observe_link_overlaps(&scenario, link, dt_s);
         }
@@ -83,8 +89,12 @@ impl World {
                 self.links.all[link].cars.iter_mut().for_each(|c| c.car.move_on(&c.held, dt_s));
             }
         }
-        self.admit(&scenario, now_s, dt_s);
-        self.enter();
+        match is_brought {
+            true => self.let_in(&scenario, now_s, dt_s)?,
+            false => self.admit(&scenario, now_s, dt_s),
+        }
+        self.enter(&scenario);
+        self.close_step()
     }
 
     /// Works out the motions of a zone's cars, updates the least margins over the step, and judges, when a vehicle
@@ -320,6 +330,11 @@ impl World {
                 car.visit.wait_s = now_s + after_s - arrival.time_s;
                 let held = Held::new(-speed_mps * after_s, speed_mps, 0.0);
                 car.x_m = held.position_m(dt_s);
+                if let Some(played) = &mut self.played {
+                    let (kind, way) = (u32::from(kind), ways.whole(way, id, zone));
+                    let Car { x_m, v_mps, .. } = car;
+                    played.admitted.push(Admitted { vehicle: id, kind, road, x_m, v_mps, way });
+                }
                 self.scratch.entries.push(Entry { zone, car });
                 leader = Some((held, kind));
             }
@@ -346,7 +361,7 @@ impl World {
     }
 
     /// Appends the newcomers to their zones, by instant of entry, then path.
-    fn enter(&mut self) {
+    fn enter(&mut self, scenario: &Scenario) {
         let entries = &mut self.scratch.entries;
         if entries.is_empty() {
             return;
@@ -354,7 +369,19 @@ impl World {
         // Those that enter at one instant are in the order in which they left the zone or the link before.
         entries.sort_by(|a, b| a.zone.cmp(&b.zone).then(a.car.entry_time_s.total_cmp(&b.car.entry_time_s)));
         for entry in entries {
-            self.cars.push(entry.zone as usize, entry.car);
+            let zone = entry.zone as usize;
+            // Only whoever is brought in may be ahead of others on its lane: they pass behind it.
+            let place = self.played.as_ref().and_then(|_| {
+                let paths = &scenario.network.zones[zone].paths;
+                let entrance = |car: &Car| paths[car.path as usize].segments[0];
+                let (car, first) = (&entry.car, self.zones[zone].first());
+                let is_behind = |other: &Car| entrance(other) == entrance(car) && other.x_m < car.x_m;
+                self.cars[zone][first..].iter().position(is_behind).map(|place| first + place)
+            });
+            self.cars.push(zone, entry.car);
+            if let Some(place) = place {
+                self.cars[zone][place..].rotate_right(1);
+            }
             self.events.push(entry.zone);
         }
         self.events.sort_unstable();

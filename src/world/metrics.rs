@@ -3,6 +3,7 @@
 use super::car::Visit;
 use super::overlap::OverlapSummary;
 use super::standstill::Stall;
+use super::traffic::TrafficSummary;
 use crate::scenario::ShieldMode;
 use serde::{Deserialize, Serialize};
 
@@ -204,6 +205,9 @@ pub struct WorldSummary {
     pub shield: ShieldSummary,
     /// What went wrong on purpose, if anything was to.
     pub faults: Option<FaultCounts>,
+    /// Who moved the vehicles, where it was not the world itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub traffic: Option<TrafficSummary>,
 }
 
 /// How often each fault of the scenario struck. Records are those of the state frames to controllers.

@@ -14,6 +14,7 @@ mod overlap;
 mod owed;
 mod role;
 mod standstill;
+mod traffic;
 mod way;
 
 pub use change::ChangeError;
@@ -22,3 +23,6 @@ pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSu
 pub use overlap::{FirstOverlap, OverlapSummary};
 pub use role::{CoordinatorMasks, Sheet, World};
 pub use standstill::Stall;
+pub use traffic::{
+    Admitted, AdvanceError, Coming, Done, Newcomer, Task, Traffic, TrafficError, TrafficSummary,
+};

@@ -91,6 +91,14 @@ impl Overlaps {
         self.summary.clone()
     }
 
+    pub(super) fn tails(&self, zone: usize) -> &[Car] {
+        &self.tails[zone]
+    }
+
+    pub(super) fn tails_mut(&mut self, zone: usize) -> &mut [Car] {
+        &mut self.tails[zone]
+    }
+
     /// Keeps a vehicle that no longer counts in a zone while its body still reaches back to it.
     pub(super) fn keep_tail(&mut self, zone: usize, car: Car, clear_from_m: f64) {
         if car.x_m < clear_from_m {
@@ -241,6 +249,9 @@ impl World {
 
     /// Settles what the tails of a zone hold over the step: what their vehicles do elsewhere.
     fn follow_tails(&mut self, scenario: &Scenario, zone: usize) {
+        if self.played.is_some() {
+            return; // They have been told already.
+        }
         for at in 0..self.overlaps.tails[zone].len() {
             let mut car = self.overlaps.tails[zone][at];
             car.command_mps2 = self.follow(scenario, zone, &mut car).u_mps2;

@@ -10,6 +10,7 @@ use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics, ZoneSummaryRow};
 use super::overlap::Overlaps;
 use super::owed::{Order, Owed};
 use super::standstill::Standstills;
+use super::traffic::{AdvanceError, Played};
 use crate::conflict::Conflicts;
 use crate::lists::{AHEAD, Lists};
 use crate::scenario::share::{neighbour_coordinators, zones_of};
@@ -76,6 +77,8 @@ pub struct World {
     pub(super) commanded: u32,
     pub(super) gateway: Gateway,
     pub(super) faults: Option<Box<Faults>>,
+    /// Who moves the vehicles, where it is not the world itself.
+    pub(super) played: Option<Box<Played>>,
 }
 
 /// What there is to know of a zone beside its vehicles.
@@ -185,6 +188,7 @@ impl World {
             commanded: 0,
             gateway: Gateway::new(&scenario, scenario.controllers(1)),
             faults: Faults::of(&scenario),
+            played: None,
             scenario,
         }
     }
@@ -207,7 +211,7 @@ impl World {
     /// Whether the run is over: all demand served, or out of time.
     pub fn is_finished(&self) -> bool {
         self.scenario.time_s(self.step) >= self.scenario.max_time_s
-            || (self.gates.exhausted() && self.links.cars == 0 && self.member_count() == 0)
+            || (self.everybody_has_come() && self.links.cars == 0 && self.member_count() == 0)
     }
 
     /// Vehicles in zones.
@@ -410,14 +414,14 @@ impl World {
     /// Integrates one step with the commands taken.
     ///
     /// # Errors
-    /// The number of vehicles without a command, when there are any.
-    pub fn advance(&mut self) -> Result<(), usize> {
+    /// When there are vehicles without a command, or whoever moves them cannot.
+    pub fn advance(&mut self) -> Result<(), AdvanceError> {
         let vehicles = self.member_count();
         let commanded = std::mem::take(&mut self.commanded) as usize;
         if commanded != vehicles {
-            return Err(vehicles.abs_diff(commanded));
+            return Err(AdvanceError::Uncommanded(vehicles.abs_diff(commanded)));
         }
-        self.integrate();
+        self.integrate()?;
         self.step += 1;
         if let Some(mut faults) = self.faults.take_if(|faults| faults.has_sensors()) {
             faults.sense(self.step, self.scenario.time_s(self.step), self.true_records());
@@ -440,6 +444,7 @@ impl World {
             stalled: self.stalls(),
             shield: self.gateway.summary(),
             faults: self.faults.as_ref().map(|faults| faults.counts()),
+            traffic: self.played.as_ref().map(|played| played.summary()),
             zones: zones
                 .map(|(i, (zone, metrics))| {
                     let mut metrics = metrics.clone();

@@ -48,6 +48,23 @@ impl<'a> Ways<'a> {
         way
     }
 
+    /// A way that begins on a path of a zone, with the paths behind it.
+    pub(super) fn begun(&self, mut way: Way, vehicle: u32, zone: ZoneId) -> Way {
+        self.look_ahead(&mut way, vehicle, zone);
+        way
+    }
+
+    /// Zones and paths of a way out of the network.
+    pub(super) fn whole(&self, mut way: Way, vehicle: u32, mut zone: ZoneId) -> Vec<(ZoneId, u32)> {
+        let mut all = vec![(zone, way.path)];
+        while way.next_zone != NONE {
+            zone = way.next_zone;
+            way = self.onward(way, vehicle, zone);
+            all.push((zone, way.path));
+        }
+        all
+    }
+
     /// The way behind the exit of a zone; the vehicle comes into `zone` next.
     pub(super) fn onward(&self, way: Way, vehicle: u32, zone: ZoneId) -> Way {
         let mut way = Way {

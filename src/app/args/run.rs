@@ -19,6 +19,10 @@ pub(in crate::app) struct RunArgs {
     /// the scenario declares.
     #[arg(long = "controller", value_name = "TARGET=COMMAND")]
     pub controllers: Vec<String>,
+    /// The command line of a program that takes the world's place, to which `cz world`'s arguments are added; it brings
+    /// in vehicles and moves them (see docs/world-contract.md).
+    #[arg(long, value_name = "COMMAND", conflicts_with = "in_process")]
+    pub world: Option<String>,
     /// What becomes of commands that are not safe, in place of the scenario's `shield`: off, observe, on.
     #[arg(long, value_name = "MODE")]
     pub shield: Option<String>,

@@ -48,6 +48,8 @@ pub(super) struct Plan<'a> {
     pub resume: Option<(&'a Path, u64)>,
     /// Where what each process did when is written.
     pub trace: Option<&'a Path>,
+    /// Who takes the world's place, for `sh -c`.
+    pub world: Option<&'a str>,
 }
 
 /// Events that may wait to be dealt with: whoever floods us waits.
@@ -159,9 +161,11 @@ fn claim(run: &RunName) -> Result<(), AppError> {
 #[derive(Clone, Debug)]
 struct Recipe {
     kind: Kind,
-    /// Of `cz`.
+    /// Of `cz`, or of the program in its place.
     arguments: Vec<OsString>,
     environment: Vec<(&'static str, OsString)>,
+    /// What a shell is to become with the arguments, where that is not `cz`.
+    shell: Option<String>,
     /// The process that was started so last.
     process: Option<u32>,
     /// Where it is and what it was granted.
@@ -238,6 +242,9 @@ impl Children {
         }
         let traced: Vec<_> = plan.trace.map(|path| (trace::VARIABLE, path.into())).into_iter().collect();
         self.add("world".to_owned(), Kind::World, world, traced.clone());
+        // The shell becomes that program, so it is its process that is watched, and its parent is who it is to be.
+        let played = plan.world.map(|command| format!("exec {command} \"$@\""));
+        self.recipes[0].shell = played;
         for (role, command, count) in
             [("coordinator", "coord", plan.share.coord_procs), ("controller", "ctrl", plan.pool)]
         {
@@ -266,7 +273,7 @@ impl Children {
         environment: Vec<(&'static str, OsString)>,
     ) {
         self.life.add(name, kind);
-        self.recipes.push(Recipe { kind, arguments, environment, process: None, settled: None });
+        self.recipes.push(Recipe { kind, arguments, environment, shell: None, process: None, settled: None });
     }
 
     /// Watches until the results are complete, or everybody has ended without any.
@@ -334,7 +341,14 @@ impl Children {
         let recipe = &mut self.recipes[member];
         // A build may have replaced the program since.
         let own = std::env::current_exe().ok().filter(|path| path.exists());
-        let mut command = Command::new(own.unwrap_or_else(|| "/proc/self/exe".into()));
+        let mut command = match &recipe.shell {
+            Some(script) => {
+                let mut command = Command::new("sh");
+                command.args(["-c", script, "sh"]);
+                command
+            }
+            None => Command::new(own.unwrap_or_else(|| "/proc/self/exe".into())),
+        };
         command.args(&recipe.arguments).envs(recipe.environment.iter().cloned());
         let stdout = match recipe.kind {
             Kind::World => Stdout::Report,

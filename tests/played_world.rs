@@ -1,0 +1,220 @@
+//! A world that others play: whoever moves the vehicles, the rest of the run does not notice.
+
+use control_zones::lockstep::LockstepError;
+use control_zones::lockstep::in_process::InProcess;
+use control_zones::scenario::{Override, Scenario, load};
+use control_zones::vehicle::Held;
+use control_zones::world::{
+    Admitted, AdvanceError, Coming, Done, Newcomer, Task, Traffic, TrafficError, WorldSummary,
+};
+use ipc_schemas::VehicleState;
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+fn scenario(name: &str, sets: &[&str]) -> Arc<Scenario> {
+    let sets: Vec<Override> = sets.iter().map(|set| set.parse().expect("a setting")).collect();
+    Arc::new(load(Some(name), &sets, None).expect("it loads"))
+}
+
+/// Moves everybody as commanded, by a clock and an integration of its own.
+#[derive(Debug)]
+struct Obedient {
+    dt_s: f64,
+    speeds_mps: BTreeMap<u32, f64>,
+}
+
+impl Traffic for Obedient {
+    fn name(&self) -> String {
+        "obedient".to_owned()
+    }
+
+    fn brings(&self) -> bool {
+        false
+    }
+
+    fn step(
+        &mut self,
+        _step: u64,
+        tasks: &[Task],
+        done: &mut [Done],
+        _newcomers: &mut Vec<Newcomer>,
+    ) -> Result<Coming, TrafficError> {
+        for (task, done) in tasks.iter().zip(done) {
+            let v_mps = self.speeds_mps.get_mut(&task.vehicle).expect("it was admitted");
+            let held = Held::new(0.0, *v_mps, if task.is_held == 1 { task.u_mps2 } else { 0.0 });
+            *v_mps = held.speed_mps(self.dt_s);
+            *done = Done { advanced_m: held.position_m(self.dt_s), v_mps: *v_mps };
+        }
+        Ok(Coming::Nobody)
+    }
+
+    fn admit(&mut self, vehicles: &[Admitted]) -> Result<(), TrafficError> {
+        for admitted in vehicles {
+            assert!(self.speeds_mps.insert(admitted.vehicle, admitted.v_mps).is_none(), "each comes once");
+        }
+        Ok(())
+    }
+}
+
+fn played(scenario: &Arc<Scenario>, traffic: Box<dyn Traffic>) -> Result<WorldSummary, LockstepError> {
+    let mut run = InProcess::played(scenario, 1, 1, traffic, false);
+    run.run()?;
+    Ok(run.world().summary())
+}
+
+/// Vehicles that do as they are told come to the same results, to rounding, whoever moves them: the seam loses nothing.
+#[test]
+fn who_does_as_told_comes_to_the_results_of_our_own_world() {
+    for (name, sets) in [
+        ("paper", &["shield=on", "end.vehicles=40"][..]),
+        ("two-merges", &["shield=on", "end.vehicles=40"]),
+        ("intersection", &["end.time_s=120"]),
+    ] {
+        let scenario = scenario(name, sets);
+        let mut own = InProcess::new(&scenario, 1, 1);
+        own.run().unwrap();
+        let own = own.world().summary();
+        let traffic = Obedient { dt_s: scenario.dt_s(), speeds_mps: BTreeMap::new() };
+        let other = played(&scenario, Box::new(traffic)).unwrap();
+        assert_eq!((other.arrived, other.departed), (own.arrived, own.departed), "{name}");
+        assert!(own.departed > 10, "{name}: {} have left", own.departed);
+        for (a, b) in own.zones.iter().zip(&other.zones) {
+            let near = |x: f64, y: f64| (x - y).abs() < 1e-6 * x.abs().max(1.0);
+            assert!(near(a.mean_time_s, b.mean_time_s) && near(a.mean_energy, b.mean_energy), "{a:?}\n{b:?}");
+            assert_eq!((a.vehicles, a.order_violations, a.overtakes), (b.vehicles, 0, 0), "{name}");
+        }
+        let traffic = other.traffic.unwrap();
+        assert!(
+            traffic.greatest_deviation_m < 1e-9 && traffic.greatest_disobedience_mps2 < 1e-9,
+            "{traffic:?}"
+        );
+        assert_eq!(other.overlaps.pairs, own.overlaps.pairs, "{name}");
+    }
+}
+
+/// Vehicles by path of the intersection's first zone, each with the step in which it comes, and where.
+#[derive(Debug, Default)]
+struct Scripted {
+    dt_s: f64,
+    coming: Vec<(u64, Newcomer)>,
+    /// Steps at which vehicles are taken out.
+    going: Vec<(u64, u32)>,
+    /// Positions from the zone's origin, and speeds.
+    here: BTreeMap<u32, (f64, f64)>,
+    brought: u32,
+    said: Option<Done>,
+}
+
+impl Traffic for Scripted {
+    fn name(&self) -> String {
+        "scripted".to_owned()
+    }
+
+    fn brings(&self) -> bool {
+        true
+    }
+
+    fn step(
+        &mut self,
+        step: u64,
+        tasks: &[Task],
+        done: &mut [Done],
+        newcomers: &mut Vec<Newcomer>,
+    ) -> Result<Coming, TrafficError> {
+        for (task, done) in tasks.iter().zip(done) {
+            if self.going.contains(&(step, task.vehicle)) {
+                self.here.remove(&task.vehicle);
+            }
+            let Some((x_m, v_mps)) = self.here.get_mut(&task.vehicle) else { continue };
+            // Whoever is not told drives on, and out of sight at last.
+            let u_mps2 = if task.is_held == 1 { task.u_mps2 } else { 0.0 };
+            let held = Held::new(*x_m, *v_mps, u_mps2);
+            *done = Done { advanced_m: held.position_m(self.dt_s) - *x_m, v_mps: held.speed_mps(self.dt_s) };
+            (*x_m, *v_mps) = (held.position_m(self.dt_s), held.speed_mps(self.dt_s));
+            if let Some(said) = self.said {
+                *done = said;
+            }
+        }
+        self.here.retain(|_, (x_m, _)| *x_m < 400.0);
+        for (_, newcomer) in self.coming.iter().filter(|(when, _)| *when == step) {
+            self.here.insert(self.brought, (newcomer.x_m, newcomer.v_mps));
+            self.brought += 1;
+            newcomers.push(*newcomer);
+        }
+        Ok(if self.coming.iter().any(|(when, _)| *when > step) { Coming::More } else { Coming::Nobody })
+    }
+
+    fn admit(&mut self, _vehicles: &[Admitted]) -> Result<(), TrafficError> {
+        unreachable!("it brings its vehicles itself")
+    }
+}
+
+fn newcomer(path: u32, x_m: f64, v_mps: f64, is_commanded: u32) -> Newcomer {
+    let none = Newcomer::NONE;
+    Newcomer { x_m, v_mps, zone: 0, path, road: none, route: none, kind: 0, is_commanded }
+}
+
+/// A traffic brings vehicles at the entrance and in the midst of a zone, commanded or not, and takes one out: those on
+/// a lane pass in the order in which they are on it, and nobody waits for one that is there no more.
+#[test]
+fn who_is_brought_in_and_taken_out_anywhere_is_reckoned_with() {
+    let scenario = scenario("intersection", &["end.time_s=120", "shield=on", "coordination.order=fifo"]);
+    let traffic = Scripted {
+        dt_s: scenario.dt_s(),
+        coming: vec![
+            (0, newcomer(0, 0.5, 10.0, 1)),
+            // Ahead of the first on its lane, though it comes after it; somebody else drives it.
+            (40, newcomer(0, 80.0, 8.0, 0)),
+            (41, newcomer(4, 0.0, 10.0, 1)),
+            (42, newcomer(7, 0.0, 10.0, 1)),
+        ],
+        going: vec![(60, 2)],
+        ..Scripted::default()
+    };
+    let mut run = InProcess::played(&scenario, 1, 1, Box::new(traffic), false);
+    let mut orders: Vec<Vec<u32>> = Vec::new();
+    while run.step().unwrap() {
+        let members = run.world().records().filter(VehicleState::is_commanded);
+        let order: Vec<u32> = members.map(|s| s.vehicle).collect();
+        if orders.last() != Some(&order) {
+            orders.push(order);
+        }
+    }
+    let expected: [&[u32]; 5] = [&[0], &[1, 0], &[1, 0, 2], &[1, 0, 2, 3], &[1, 0, 3]];
+    assert_eq!(orders[..5], expected, "{orders:?}");
+    let summary = run.world().summary();
+    let traffic = summary.traffic.unwrap();
+    assert_eq!((summary.arrived, summary.departed, traffic.gone, traffic.uncommanded), (4, 3, 1, 1));
+    assert_eq!(summary.overlaps.pairs, 0);
+}
+
+/// What a traffic says is checked, and what is wrong with it said in a line.
+#[test]
+fn what_cannot_be_is_refused() {
+    let intersection = scenario("intersection", &["end.time_s=20"]);
+    let fails = |traffic: Scripted| {
+        let traffic = Box::new(Scripted { dt_s: intersection.dt_s(), ..traffic });
+        match played(&intersection, traffic).unwrap_err() {
+            LockstepError::World { error: error @ AdvanceError::Traffic { .. }, .. } => error.to_string(),
+            other => panic!("{other:?}"),
+        }
+    };
+    let coming = |newcomer: Newcomer| Scripted { coming: vec![(0, newcomer)], ..Scripted::default() };
+    let good = newcomer(0, 0.0, 10.0, 1);
+    for (bad, what) in [
+        (Newcomer { zone: 9, ..good }, "newcomer 0: zone is 9, expected less than 1"),
+        (Newcomer { path: 99, ..good }, "path is 99, expected less than"),
+        (Newcomer { x_m: f64::NAN, ..good }, "x_m is NaN, expected from 0"),
+        (Newcomer { x_m: 1e9, ..good }, "x_m is 1000000000, expected from 0"),
+        (Newcomer { v_mps: -1.0, ..good }, "v_mps is -1, expected a number >= 0"),
+        (Newcomer { kind: 3, ..good }, "kind is 3, expected less than 1"),
+        (Newcomer { road: 0, route: 0, ..good }, "route is 0, expected one of road 0"),
+    ] {
+        let said = fails(coming(bad));
+        assert!(said.starts_with("scripted: ") && said.contains(what), "{said}");
+    }
+    for said in [Done { advanced_m: -1.0, v_mps: 1.0 }, Done { advanced_m: 1.0, v_mps: f64::NAN }] {
+        let error = fails(Scripted { said: Some(said), ..coming(good) });
+        assert!(error.contains("vehicle 0 has come"), "{error}");
+    }
+}
