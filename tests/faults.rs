@@ -293,7 +293,7 @@ fn what_a_process_may_not_have_is_said() {
     let said = limited("-n 24");
     assert!(said.contains("only 24 files may be open, see `ulimit -n`"), "{said}");
     let said = limited("-v 30000");
-    assert!(said.contains("memory"), "{said}");
+    assert!(said.contains("30000 kB of memory only, see `ulimit -v`"), "{said}");
     let folder = tempfile::tempdir().unwrap();
     let deep = folder.path().join("d".repeat(130));
     std::fs::create_dir(&deep).unwrap();

@@ -25,7 +25,7 @@ use child::{Event, Stdout};
 use crossbeam::channel::{Receiver, Sender, bounded, select, unbounded};
 pub(super) use keep::keep;
 use life::{Act, Failure, GRACE, Kind, Life, Stage};
-use rustix::process::{Signal, getpid, set_child_subreaper};
+use rustix::process::{Resource, Signal, getpid, getrlimit, set_child_subreaper};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -73,6 +73,7 @@ pub(super) fn conduct(
     let mut observation = None;
     let mut recording = recording;
     let mut watch = || {
+        check_memory()?;
         claim(&plan.run)?;
         let mut children = Children::new(plan, recording.is_some())?;
         observation = recording.take().map(|recording| {
@@ -139,6 +140,21 @@ fn point_to(recording: Option<PathBuf>, error: AppError) -> AppError {
         AppError::Failed(text) => AppError::Failed(format!("{text}\n  {how}")),
         AppError::Interrupted(text) => AppError::Interrupted(format!("{text}; {how}")),
         other => other,
+    }
+}
+
+/// Memory that a process may map, bytes: with less it may be that none is left to say so.
+const LEAST_MEMORY: u64 = 64 << 20;
+
+/// Refuses a run whose processes, which have the limits of this one, could not get by.
+fn check_memory() -> Result<(), AppError> {
+    match getrlimit(Resource::As).current {
+        Some(most) if most < LEAST_MEMORY => Err(AppError::Failed(format!(
+            "each process may have {} kB of memory only, see `ulimit -v`; expected {} or more",
+            most >> 10,
+            LEAST_MEMORY >> 10
+        ))),
+        _ => Ok(()),
     }
 }
 
