@@ -81,7 +81,8 @@ class Ocbf:
         phi, u_min = p.reaction_time_s, p.u_min_mps2
         rows = []  # (coefficient, bound): coefficient * u <= bound
         good = True
-        for kind, _, xp, vp, up, at, gap in partners:
+        for partner in partners:
+            kind, xp, vp, up, at, gap = partner.kind, partner.x, partner.v, partner.u, partner.at, partner.gap
             if kind == s.CONSTRAINT_REAR_END:
                 b = xp - x - phi * v - gap
                 reserve = vp - v - phi * u_min

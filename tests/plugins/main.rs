@@ -8,6 +8,7 @@ mod common;
 mod forged;
 mod hostile;
 mod sdks;
+mod tools;
 
 use std::path::Path;
 use std::process::Command;

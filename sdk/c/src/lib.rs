@@ -56,9 +56,11 @@ pub struct Partner {
     pub gap_m: f64,
     /// `CZ_CONSTRAINT_REAR_END`, `CZ_CONSTRAINT_MERGE` or `CZ_CONSTRAINT_CROSS`: what is owed to it now.
     pub kind: u64,
+    /// Its place among the records of the zone.
+    pub place: u64,
 }
 
-const _: () = assert!(size_of::<Partner>() == 32 + size_of::<usize>());
+const _: () = assert!(size_of::<Partner>() == 40 + size_of::<usize>());
 
 /// One vehicle to be commanded, with its partners looked up.
 #[repr(C)]
@@ -84,9 +86,49 @@ pub struct Vehicle {
     pub scheduled_at_m: f64,
     /// Instant before which it is not to be there, s; NaN when nothing is scheduled.
     pub scheduled_time_s: f64,
+    /// What this controller commanded it for the step just ended, m/s^2; NaN when it did not.
+    pub commanded_mps2: f64,
+    /// Its place among the records of the zone.
+    pub place: u64,
+    /// All records of its zone, and their number.
+    pub zone_states: *const VehicleState,
+    /// Their number.
+    pub zone_count: u64,
 }
 
-const _: () = assert!(size_of::<Vehicle>() == 56 + 3 * size_of::<usize>());
+const _: () = assert!(size_of::<Vehicle>() == 80 + 4 * size_of::<usize>());
+
+/// A step to be answered.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default)]
+pub struct StepInfo {
+    /// Its number.
+    pub step: u64,
+    /// Simulated time, s.
+    pub time_s: f64,
+    /// Steps that have passed without this controller since its last answer.
+    pub skipped: u64,
+    /// 1 when the world put something in for a controller that was late in the step before, otherwise 0.
+    pub missed: u64,
+}
+
+/// What a run has been for a controller, as the controller saw it.
+#[repr(C)]
+#[derive(Clone, Copy, Debug, Default)]
+pub struct RunSummary {
+    /// Step of the last state seen.
+    pub step: u64,
+    /// Simulated time of it, s.
+    pub time_s: f64,
+    /// Steps answered.
+    pub answered: u64,
+    /// Steps that passed without this controller between its answers.
+    pub skipped: u64,
+    /// Of the states seen, those before which the world had put something in for a controller that was late.
+    pub missed: u64,
+}
+
+const _: () = assert!(size_of::<StepInfo>() == 32 && size_of::<RunSummary>() == 40);
 
 fn fail(message: &str) {
     let text = CString::new(message.replace('\0', " ")).unwrap_or_default();
@@ -213,14 +255,26 @@ impl Plugin {
                 merge_at_m: f64::NAN,
                 scheduled_at_m,
                 scheduled_time_s,
+                commanded_mps2: vehicle.commanded_mps2.unwrap_or(f64::NAN),
+                place: vehicle.place as u64,
+                zone_states: vehicle.zone_states().as_ptr(),
+                zone_count: vehicle.zone_states().len() as u64,
             };
-            for control_zones_plugin::Partner { state, kind, x_m, conflict_m, gap_m } in vehicle.partners() {
+            for partner in vehicle.partners() {
+                let control_zones_plugin::Partner { state, place, kind, x_m, conflict_m, gap_m } = partner;
                 let code = match kind {
                     PartnerKind::RearEnd => CONSTRAINT_REAR_END,
                     PartnerKind::Merge => CONSTRAINT_MERGE,
                     PartnerKind::Cross => CONSTRAINT_CROSS,
                 };
-                self.partners.push(Partner { state, x_m, at_m: conflict_m, gap_m, kind: code.into() });
+                self.partners.push(Partner {
+                    state,
+                    x_m,
+                    at_m: conflict_m,
+                    gap_m,
+                    kind: code.into(),
+                    place: place as u64,
+                });
                 // The nearest of several.
                 if kind == PartnerKind::RearEnd {
                     if found.ahead.is_null() || x_m < found.ahead_x_m {
@@ -269,6 +323,33 @@ pub unsafe extern "C" fn cz_path_name(plugin: *const Plugin, index: usize) -> *c
     // SAFETY: a live handle.
     let names = unsafe { &(*plugin).names };
     names.get(index).map_or(null(), |name| name.as_ptr())
+}
+
+/// The step to be answered: its number, time and flags; zeros without one.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`, and `cz_wait` has returned `CZ_STEP`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_step(plugin: *const Plugin) -> StepInfo {
+    // SAFETY: a live handle.
+    let session = unsafe { &(*plugin).session };
+    guarded(StepInfo::default(), || {
+        let step = session.step();
+        let (time_s, skipped, missed) = (step.time_s, step.skipped, u64::from(step.missed));
+        Ok(StepInfo { step: step.header.step, time_s, skipped, missed })
+    })
+}
+
+/// What the run has been so far, as this controller saw it.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_summary(plugin: *const Plugin) -> RunSummary {
+    // SAFETY: a live handle.
+    let control_zones_plugin::Summary { step, time_s, answered, skipped, missed } =
+        unsafe { (*plugin).session.summary() };
+    RunSummary { step, time_s, answered, skipped, missed }
 }
 
 /// The header of the state frame; valid until `cz_send`. Null without a step.

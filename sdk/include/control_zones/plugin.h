@@ -62,12 +62,17 @@ typedef struct cz_vehicle {
     double merge_at_m;   /**< distance of their conflict point on the vehicle's path, m, or NaN */
     double scheduled_at_m;   /**< place on its path that it is scheduled for, m, or NaN */
     double scheduled_time_s; /**< instant before which it is not to be there, s, or NaN */
+    double commanded_mps2;   /**< what this controller commanded it for the step just ended, m/s^2, or NaN; what was
+                                  applied is state->u_mps2, and the rest is the shield's or the speed limit's */
+    uint64_t place;          /**< its place among the records of its zone */
+    const cz_vehicle_state_t *zone_states; /**< all records of its zone */
+    uint64_t zone_count;     /**< their number */
 } cz_vehicle_t;
 
 #if defined(__cplusplus)
-static_assert(sizeof(cz_vehicle_t) == 56 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
+static_assert(sizeof(cz_vehicle_t) == 80 + 4 * sizeof(void *), "cz_vehicle_t as in the library");
 #elif defined(__STDC_VERSION__) && __STDC_VERSION__ >= 201112L
-_Static_assert(sizeof(cz_vehicle_t) == 56 + 3 * sizeof(void *), "cz_vehicle_t as in the library");
+_Static_assert(sizeof(cz_vehicle_t) == 80 + 4 * sizeof(void *), "cz_vehicle_t as in the library");
 #endif
 
 /** A vehicle that another must respect where the two are now. */
@@ -77,7 +82,25 @@ typedef struct cz_partner {
     double at_m;   /**< distance of the conflict point on the vehicle's path, m; means nothing toward a leader */
     double gap_m;  /**< distance to be kept to it beside phi v, m */
     uint64_t kind; /**< CZ_CONSTRAINT_REAR_END, CZ_CONSTRAINT_MERGE or CZ_CONSTRAINT_CROSS */
+    uint64_t place; /**< its place among the records of the zone; its broadcast intent stands in state */
 } cz_partner_t;
+
+/** A step to be answered. */
+typedef struct cz_step {
+    uint64_t step;    /**< its number */
+    double time_s;    /**< simulated time, s */
+    uint64_t skipped; /**< steps that have passed without this controller since its last answer */
+    uint64_t missed;  /**< 1 when the world put something in for one that was late in the step before */
+} cz_step_t;
+
+/** What a run has been for a controller, as the controller saw it. */
+typedef struct cz_summary {
+    uint64_t step;     /**< step of the last state seen */
+    double time_s;     /**< simulated time of it, s */
+    uint64_t answered; /**< steps answered */
+    uint64_t skipped;  /**< steps that passed without this controller between its answers */
+    uint64_t missed;   /**< states before which the world had put something in for one that was late */
+} cz_summary_t;
 
 /** Joins a run. NULL names stand for the environment's CZ_RUN and CZ_CONTROLLER. NULL on failure. */
 cz_plugin_t *cz_attach(const char *run, const char *controller, double timeout_s);
@@ -93,6 +116,10 @@ const cz_run_spec_t *cz_run_spec(const cz_plugin_t *plugin);
 const cz_path_spec_t *cz_paths(const cz_plugin_t *plugin, size_t *count);
 /** Name of a path, ZONE.PATH; NULL beyond the last. Valid until detached. */
 const char *cz_path_name(const cz_plugin_t *plugin, size_t index);
+/** The step to be answered: its number, time and flags. */
+cz_step_t cz_step(const cz_plugin_t *plugin);
+/** What the run has been so far; after CZ_END, all of it. */
+cz_summary_t cz_summary(const cz_plugin_t *plugin);
 /** Header of the state frame; valid until cz_send. */
 const cz_frame_header_t *cz_header(const cz_plugin_t *plugin);
 /** The state frame, all zones; valid until cz_send. */

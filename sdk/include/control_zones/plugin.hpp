@@ -72,6 +72,16 @@ public:
     Range<const cz_path_spec_t> paths() const { return range(cz_paths); }
     Range<const cz_vehicle_state_t> states() const { return range(cz_states); }
     Range<const cz_vehicle_t> vehicles() const { return range(cz_vehicles); }
+    /// All that the vehicle at this place among vehicles() must respect.
+    Range<const cz_partner_t> partners(std::size_t vehicle) const {
+        std::size_t count = 0;
+        const cz_partner_t *data = cz_partners(plugin_.get(), vehicle, &count);
+        return {data, count};
+    }
+    /// The step to be answered: its number, time and flags.
+    cz_step_t step() const { return cz_step(plugin_.get()); }
+    /// What the run has been so far.
+    cz_summary_t summary() const { return cz_summary(plugin_.get()); }
 
     /// The command frame being written.
     Range<cz_vehicle_command_t> commands() {
@@ -110,6 +120,22 @@ template <class Law> void run(Law &&law) {
         }
         session.send();
     }
+}
+
+/// Joins the run the environment names and answers every step: `controller.step(session, vehicle, place)` is the
+/// acceleration of the vehicle at that place among `session.vehicles()`; `controller.on_end(summary)` is called when the
+/// run is over.
+template <class Controller> void drive(Controller &controller) {
+    Session session;
+    while (session.wait()) {
+        auto vehicles = session.vehicles();
+        auto commands = session.commands();
+        for (std::size_t i = 0; i < vehicles.size(); ++i) {
+            commands[i].u_mps2 = controller.step(std::as_const(session), vehicles[i], i);
+        }
+        session.send();
+    }
+    controller.on_end(session.summary());
 }
 
 } // namespace control_zones

@@ -17,7 +17,7 @@ may be kept, where numpy is installed, and lists where it is not.
 
 from . import _schemas as schemas
 from ._features import features
-from ._session import Error, Run, Session, run
+from ._session import Error, Run, Session, Summary, run
 from ._view import Partner, ZoneView
 
-__all__ = ["Error", "Partner", "Run", "Session", "ZoneView", "features", "run", "schemas"]
+__all__ = ["Error", "Partner", "Run", "Session", "Summary", "ZoneView", "features", "run", "schemas"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import dataclasses
 import fcntl
 import os
 import random
@@ -23,6 +24,8 @@ if typing.TYPE_CHECKING:
 
     #: One acceleration per vehicle of the view, m/s^2.
     Controller = Callable[[ZoneView], Iterable[float]]
+    #: The same for all zones at once.
+    JointController = Callable[[list[ZoneView]], Iterable[Iterable[float]]]
     Record = typing.TypeVar("Record", bound=ctypes.Structure)
 
 #: Seconds of polling before sleeping between polls.
@@ -42,6 +45,21 @@ _LATE = "late"
 
 class Error(Exception):
     """Why a controller cannot go on."""
+
+
+@dataclasses.dataclass
+class Summary:
+    """What a run has been for a controller, as the controller saw it."""
+
+    #: Step of the last state seen, and simulated time of it, s.
+    step: int = 0
+    time: float = 0.0
+    #: Steps answered.
+    answered: int = 0
+    #: Steps that passed without this controller between its answers.
+    skipped: int = 0
+    #: Of the states seen, those before which the world had put something in for a controller that was late.
+    missed: int = 0
 
 
 class Run:
@@ -207,6 +225,12 @@ class Session:
         self._partners: dict[int, Partners] = {}
         # The first step whose coordination is not in force yet.
         self._next_step = 0
+        # Behind the last step that has been answered: a state may come again, for somebody who has just joined.
+        self._open_from = 0
+        #: What the run has been so far, as this controller saw it.
+        self.summary = Summary()
+        # Accelerations of the last answer, by vehicle.
+        self._commanded: dict[int, float] = {}
         self._ask_again_at: float | None = None
         self._state: _State | None = None
         self._complete = False
@@ -322,8 +346,20 @@ class Session:
                 return None
         # Otherwise its coordination is in force already.
         self._next_step = max(self._next_step, step + 1)
+        self.summary.skipped += self._skipped(state.header)
+        self._saw(state.header)
         self._complete = True
         return True
+
+    def _saw(self, header: s.FrameHeader) -> None:
+        """Notes a state for the summary."""
+        self.summary.step = header.step
+        self.summary.time = header.time_ns * 1e-9
+        self.summary.missed += bool(header.flags & s.FLAG_MISSED)
+
+    def _skipped(self, header: s.FrameHeader) -> int:
+        """Steps that have passed without this controller since its last answer."""
+        return max(0, header.step - self._open_from) if self.summary.answered else 0
 
     def _take_states(self) -> bool:
         """Takes the newest state; an older one would be answered too late. Whether the run is over."""
@@ -338,10 +374,12 @@ class Session:
                 self._refuse(header, sample, fault)
                 continue
             if header.flags & s.FLAG_END_OF_RUN:
+                self._saw(header)
                 return True
-            newest = 0 if self._state is None else self._state.header.step
+            # The same may come again, when of its coordination some has been taken.
+            is_newer = self._state is None or header.step > self._state.header.step
             # Of the step before the next one, the coordination is known: it may still be answered.
-            if header.step >= newest and header.step + 1 >= self._next_step:
+            if is_newer and header.step >= self._open_from and header.step + 1 >= self._next_step:
                 self._state = _State(header, sample)
         if self._state is not None and self._state.header.step + 1 < self._next_step:
             self._state = None
@@ -466,8 +504,9 @@ class Session:
         """Number of the step to be answered; None while there is none."""
         return self._state.header.step if self._state is not None and self._complete else None
 
-    def answer(self, controller: Controller) -> None:
-        """Answers the step: calls `controller(view)` for each of its zones and sends what it returns.
+    def answer(self, controller: Controller | JointController, joint: bool = False) -> None:
+        """Answers the step: calls `controller(view)` for each of its zones and sends what it returns; if `joint`, calls
+        `controller(views)` once, which returns as many lists of accelerations.
 
         An answer that comes too late is dropped: the next step is another chance.
         """
@@ -478,6 +517,7 @@ class Session:
         count = sum(len(own) for _, _, own in zones)
         commands = (s.VehicleCommand * count)()
         records = structured(commands)
+        views: list[ZoneView] = []
         at = 0
         for zone, (start, end), own in zones:
             if not own:
@@ -496,10 +536,22 @@ class Session:
                 command.mode = s.MODE_OCBF
             name = self.run.zone_names[zone]
             partners = self._partners[zone]
-            view = ZoneView(self.run, zone, name, header, frozen(frame[start:end]), places, partners, part)
-            for k, u in enumerate(_accelerations(controller, view, len(own))):
-                commands[at + k].u_mps2 = u
+            # Of an older answer nothing says what was applied.
+            commanded = self._commanded if header.step == self._open_from else None
+            skipped = self._skipped(header)
+            records_ = frozen(frame[start:end])
+            views.append(
+                ZoneView(
+                    self.run, zone, name, header, records_, places, partners, part, frozen(frame), skipped, commanded
+                )
+            )
             at += len(own)
+        at = 0
+        for view, accelerations in zip(views, _decided(controller, views, joint, header.step)):
+            for k, u in enumerate(accelerations):
+                commands[at + k].u_mps2 = u
+            at += len(view)
+        self._commanded = {command.vehicle: command.u_mps2 for command in commands}
         self._send(header, commands)
 
     def _send(self, header: s.FrameHeader, commands: ctypes.Array[s.VehicleCommand]) -> None:
@@ -519,6 +571,8 @@ class Session:
             ctypes.memmove(loan.payload_ptr, commands, ctypes.sizeof(commands))
         out = None
         reached = loan.assume_init().send()
+        self._open_from = header.step + 1
+        self.summary.answered += 1
         self._state = None
         self._complete = False
         # Nobody has room for an answer that is too late, and nobody is there once the world has gone.
@@ -608,11 +662,31 @@ def _claim(header: s.FrameHeader, process: int) -> str:
     return f"{name} {header.sender_index} (process {process})"
 
 
-def _accelerations(controller: Controller, view: ZoneView, count: int) -> list[float]:
-    """What the controller decides for a zone, as numbers; if it cannot be, what to do about it."""
-    where = f"step {view.step}, zone {view.name}"
+def _decided(
+    controller: typing.Any, views: list[ZoneView], joint: bool, step: int
+) -> typing.Iterator[list[float]]:
+    """What the controller decides for each zone, as numbers; if it cannot be, what to do about it."""
+    if not joint:
+        for view in views:
+            where = f"step {view.step}, zone {view.name}"
+            yield _accelerations(_called(controller, view, where), where, len(view))
+        return
+    where = f"step {step}"
+    all_ = _called(controller, views, where)
+    expected = f"expected {len(views)} lists of accelerations, one per zone"
     try:
-        u = controller(view)
+        lists = list(all_)
+    except TypeError as error:
+        raise Error(f"{where}: the controller returned {_kind(all_)}; {expected}") from error
+    if len(lists) != len(views):
+        raise Error(f"{where}: the controller returned {len(lists)} lists; {expected}")
+    for view, u in zip(views, lists):
+        yield _accelerations(u, f"{where}, zone {view.name}", len(view))
+
+
+def _called(controller: typing.Any, shown: ZoneView | list[ZoneView], where: str) -> typing.Any:
+    try:
+        return controller(shown)
     except ValueError as error:
         if "read-only" not in str(error):
             raise
@@ -620,12 +694,18 @@ def _accelerations(controller: Controller, view: ZoneView, count: int) -> list[f
             f"{where}: the arrays of a zone are read-only; make one of your own, such as `err = zone.v - 15` "
             "or `v = zone.v.copy()`"
         ) from error
+
+
+def _kind(value: object) -> str:
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
+def _accelerations(u: typing.Any, where: str, count: int) -> list[float]:
     expected = f"expected {count} accelerations, one per vehicle"
     try:
         numbers = [float(number) for number in u]
     except (TypeError, ValueError) as error:
-        kind = "None" if u is None else f"a {type(u).__name__}"
-        raise Error(f"{where}: the controller returned {kind}; {expected}") from error
+        raise Error(f"{where}: the controller returned {_kind(u)}; {expected}") from error
     if len(numbers) != count:
         raise Error(f"{where}: the controller returned {len(numbers)} accelerations; {expected}")
     return numbers
@@ -645,16 +725,23 @@ def _pause(deadline: float, late: Error) -> None:
 
 
 def run(
-    controller: Controller, run: str | None = None, name: str | None = None, attach_timeout: float = 30.0
+    controller: Controller | JointController,
+    run: str | None = None,
+    name: str | None = None,
+    attach_timeout: float = 30.0,
+    joint: bool = False,
 ) -> None:
     """Joins a run and answers every step to its end.
 
-    `controller` is a function from a `ZoneView` to one acceleration per vehicle (m/s^2). If it has a method
-    `attached`, that is called first with the `Run`. Run and controller name come from the environment
+    `controller` is a function from a `ZoneView` to one acceleration per vehicle (m/s^2); if `joint`, from a list of them,
+    one per zone with vehicles, to as many lists. If it has a method `attached`, that is called first with the `Run`; if it
+    has `on_end`, that is called with the `Summary` when the run is over. Run and controller name come from the environment
     (`CZ_RUN`, `CZ_CONTROLLER`) unless given.
     """
     with Session(run, name, attach_timeout) as session:
         if hasattr(controller, "attached"):
             controller.attached(session.run)
         while session.wait():
-            session.answer(controller)
+            session.answer(controller, joint)
+        if hasattr(controller, "on_end"):
+            controller.on_end(session.summary)

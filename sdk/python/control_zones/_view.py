@@ -21,10 +21,11 @@ if typing.TYPE_CHECKING:
 
     Floats = NDArray[numpy.float64]
     Ids = NDArray[numpy.uint32]
+    Flags = NDArray[numpy.bool_]
 
 NAN = float("nan")
-#: Records in a zone's slice that are not members.
-_LEFT = s.STATE_LEFT
+#: What is shown of a partner.
+_PARTNER_FIELDS = ("x_m", "v_mps", "u_mps2", "planned_exit_time_s", "planned_exit_speed_mps")
 
 
 class ZoneView:
@@ -52,7 +53,14 @@ class ZoneView:
             coordinate; NaN where there is none.
         merge_at: distance of that conflict point on the vehicle's own path, m.
         partners: for each vehicle a list of all it must respect where they are now, each a `Partner`.
+        entered: whether each vehicle has entered the zone in the step just ended.
+        commanded: what this controller commanded each vehicle for the step just ended, m/s^2; NaN where it did not. What
+            was applied is `u`, and the rest is the shield's, or what the speed limit allowed.
         states: all records of the zone, index 0 (the vehicle that left it last) included.
+        own: of each of those, whether it is a vehicle to be commanded.
+        frame: the records of all zones.
+        missed: whether the world put something in for a controller that was late in the step before.
+        skipped: steps that have passed without this controller since its last answer.
         commands: the records that will be sent, the only array to be written to; `u_mps2` is filled from what
             the function returns, other fields, such as the planned exit, may be set here.
     """
@@ -64,7 +72,10 @@ class ZoneView:
     time: float
     dt: float
     states: typing.Any
+    frame: typing.Any
     commands: typing.Any
+    missed: bool
+    skipped: int
 
     def __init__(
         self,
@@ -76,6 +87,9 @@ class ZoneView:
         own: slice | list[int],
         partners: Partners,
         commands: typing.Any,
+        frame: typing.Any = None,
+        skipped: int = 0,
+        commanded: dict[int, float] | None = None,
     ) -> None:
         self.run = run
         self.zone = zone
@@ -84,7 +98,11 @@ class ZoneView:
         self.time = header.time_ns * 1e-9
         self.dt = run.spec.dt_s
         self.states = states
+        self.frame = states if frame is None else frame
         self.commands = commands
+        self.missed = bool(header.flags & s.FLAG_MISSED)
+        self.skipped = skipped
+        self._commanded = commanded or {}
         self._own = own
         self._partners = partners
         self._cache: dict[object, Floats] = {}
@@ -139,6 +157,37 @@ class ZoneView:
     @property
     def entry_speed(self) -> Floats:
         return self._field("entry_speed_mps")
+
+    @property
+    def entered(self) -> Flags:
+        def entered() -> typing.Any:
+            flags = self._field("flags")
+            if numpy is not None:
+                return (flags.astype(int) & s.STATE_ENTERED) != 0
+            return [bool(int(f) & s.STATE_ENTERED) for f in flags]
+
+        return typing.cast("Flags", self._once("entered", entered))
+
+    @property
+    def own(self) -> Flags:
+        def own() -> typing.Any:
+            places = self._own
+            count = len(self.states)
+            if isinstance(places, slice):
+                places = list(range(*places.indices(count)))
+            if numpy is not None:
+                mask = numpy.zeros(count, dtype=bool)
+                mask[places] = True
+                return mask
+            known = set(places)
+            return [i in known for i in range(count)]
+
+        return typing.cast("Flags", self._once("own", own))
+
+    @property
+    def commanded(self) -> Floats:
+        known = self._commanded
+        return self._once("commanded", lambda: _array([known.get(int(v), NAN) for v in self.vehicle]))
 
     @property
     def length(self) -> Floats:
@@ -218,6 +267,11 @@ class Partner(typing.NamedTuple):
     at: float
     #: Distance to be kept to it beside phi v, m.
     gap: float
+    #: Its place among `states` of the view.
+    place: int
+    #: Its broadcast intent: when it plans to reach the end of its path, s (0 without a plan), and how fast, m/s.
+    exit_time: float
+    exit_speed: float
 
 
 def _of(partners: list[Partner], ahead: bool) -> list[Partner]:
@@ -265,20 +319,21 @@ class Partners:
     def now(self, states: typing.Any, own_x: Iterable[float]) -> list[list[Partner]]:
         """What is owed where the vehicles are: for each a list of `Partner`."""
         if numpy is None:
-            at = [(r.x_m, r.v_mps, r.u_mps2) for r in states]
+            at = [tuple(getattr(r, name) for name in _PARTNER_FIELDS) for r in states]
         else:
-            at = list(zip(states["x_m"].tolist(), states["v_mps"].tolist(), states["u_mps2"].tolist()))
+            at = list(zip(*(states[name].tolist() for name in _PARTNER_FIELDS)))
         all_ = []
         for x_own, owed in zip(own_x, self._owed):
             partners = []
             for place, vehicle, kind, own_m, partner_m, gap, until in owed:
-                x, v, u = at[place]
+                x, v, u, exit_time, exit_speed = at[place]
                 if x >= until or kind == s.CONSTRAINT_CROSS and x_own >= own_m:
                     continue
                 # Behind the merge the one that passed it first is the leader.
                 if kind == s.CONSTRAINT_MERGE and x_own >= own_m:
                     kind = s.CONSTRAINT_REAR_END
-                partners.append(Partner(kind, vehicle, x + own_m - partner_m, v, u, own_m, gap))
+                where = x + own_m - partner_m
+                partners.append(Partner(kind, vehicle, where, v, u, own_m, gap, place, exit_time, exit_speed))
             all_.append(partners)
         return all_
 

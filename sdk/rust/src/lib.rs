@@ -17,7 +17,7 @@ mod view;
 pub use inbox::Refused;
 pub use ipc_schemas as schemas;
 pub use session::{Commands, Session, Wake};
-pub use view::{Partner, PartnerKind, Path, Run, Step, Vehicle};
+pub use view::{Partner, PartnerKind, Path, Run, Step, Summary, Vehicle};
 
 use ipc_schemas::VehicleCommand;
 use std::time::Duration;
@@ -102,6 +102,9 @@ pub trait Controller {
 
     /// Whatever else the commands are to say: the plan and broadcast intent. They are filled in otherwise.
     fn annotate(&mut self, _step: &Step<'_>, _commands: &mut [VehicleCommand]) {}
+
+    /// Called once, when the run is over.
+    fn on_end(&mut self, _summary: &Summary) {}
 }
 
 /// Joins the run the environment names and answers every step to its end.
@@ -117,7 +120,10 @@ pub fn run_with(options: &Options, controller: &mut impl Controller) -> Result<(
     loop {
         match session.wait(Duration::from_secs(1))? {
             Wake::Timeout => {}
-            Wake::End => return Ok(()),
+            Wake::End => {
+                controller.on_end(&session.summary());
+                return Ok(());
+            }
             Wake::Step => {
                 accelerations.clear();
                 accelerations.resize(session.count(), 0.0);

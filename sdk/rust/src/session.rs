@@ -3,7 +3,7 @@
 use crate::attach::{self, name};
 use crate::inbox::{Frame, Inbox, Refusal, Refusals, Refused};
 use crate::space::{Space, failed};
-use crate::view::{Board, Run, Step};
+use crate::view::{Board, Run, Step, Summary};
 use crate::{Error, Options};
 use iceoryx2::port::BackpressureAction;
 use iceoryx2::port::publisher::Publisher;
@@ -11,8 +11,8 @@ use iceoryx2::prelude::AllocationStrategy;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::ipc;
 use ipc_schemas::{
-    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, HeaderFault,
-    Member, Role, VehicleCommand, VehicleState,
+    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader,
+    HeaderFault, Member, Role, VehicleCommand, VehicleState,
 };
 use std::time::{Duration, Instant};
 
@@ -54,11 +54,16 @@ pub struct Session {
     coordinators: Vec<Seat>,
     /// The first step whose coordination is not in force yet.
     next_step: u64,
+    /// Behind the last step that has been answered: a state may come again, for somebody who has just joined.
+    open_from: u64,
     /// When to ask again for what was missed, while that has not come.
     ask_again_at: Option<Instant>,
     is_complete: bool,
     board: Board,
     refusals: Refusals,
+    /// Accelerations of the last answer, by vehicle, ascending.
+    commanded: Vec<(u32, f64)>,
+    summary: Summary,
 }
 
 /// A coordinator, as the world says.
@@ -128,10 +133,13 @@ impl Session {
             line,
             _space: space,
             next_step,
+            open_from: 0,
             ask_again_at: None,
             is_complete: false,
             board,
             refusals: Refusals::default(),
+            commanded: Vec::new(),
+            summary: Summary::default(),
             run,
             reply,
             world_origins: [None; 2],
@@ -199,6 +207,12 @@ impl Session {
         }
         // Otherwise its coordination is in force already.
         self.next_step = self.next_step.max(step.saturating_add(1));
+        let header = state.header;
+        if self.summary.answered > 0 {
+            self.summary.skipped += header.step.saturating_sub(self.open_from);
+        }
+        self.saw(&header);
+        let Some(state) = self.pending.as_ref() else { return Ok(None) };
         self.board.muster(&self.run, state.frame.payload());
         self.is_complete = true;
         Ok(Some(Wake::Step))
@@ -217,11 +231,13 @@ impl Session {
                 continue;
             }
             if header.flags & FLAG_END_OF_RUN != 0 {
+                self.saw(&header);
                 return Ok(true);
             }
-            let newest = self.pending.as_ref().map_or(0, |state| state.header.step);
+            // The same may come again, when of its coordination some has been taken.
+            let is_newer = self.pending.as_ref().is_none_or(|state| header.step > state.header.step);
             // Of the step before the next one, the coordination is known: it may still be answered.
-            if header.step >= newest && header.step.saturating_add(1) >= self.next_step {
+            if is_newer && header.step >= self.open_from && header.step.saturating_add(1) >= self.next_step {
                 self.pending = Some(Pending { frame, header, missing: header.coordinators_acting });
             }
         }
@@ -230,6 +246,13 @@ impl Session {
             self.pending = None;
         }
         Ok(false)
+    }
+
+    /// Notes a state for the summary.
+    fn saw(&mut self, header: &FrameHeader) {
+        self.summary.step = header.step;
+        self.summary.time_s = header.time_ns as f64 * 1e-9;
+        self.summary.missed += u64::from(header.flags & FLAG_MISSED != 0);
     }
 
     fn judge_state(&mut self, header: &FrameHeader, origin: u128, records: usize) -> Result<(), Refusal> {
@@ -387,9 +410,21 @@ impl Session {
             header: &state.header,
             time_s: state.header.time_ns as f64 * 1e-9,
             states: state.frame.payload(),
+            missed: state.header.flags & FLAG_MISSED != 0,
+            skipped: match self.summary.answered {
+                0 => 0,
+                _ => state.header.step.saturating_sub(self.open_from),
+            },
+            // Of an older answer nothing says what was applied.
+            commanded: if state.header.step == self.open_from { &self.commanded } else { &[] },
             run: &self.run,
             board: &self.board,
         }
+    }
+
+    /// What the run has been so far, as this controller saw it.
+    pub fn summary(&self) -> Summary {
+        self.summary
     }
 
     /// The coordination in force in a zone.
@@ -438,11 +473,16 @@ impl Session {
 
     /// Sends the answer to this step. One that comes too late is dropped: the next step is another chance.
     pub fn send(&mut self, commands: Commands) -> Result<(), Error> {
+        self.commanded.clear();
+        self.commanded.extend(commands.0.payload().iter().map(|c| (c.vehicle, c.u_mps2)));
+        self.commanded.sort_unstable_by_key(|(vehicle, _)| *vehicle);
         let reached = commands.0.send().map_err(|e| failed("send commands", &e))?;
         // Nobody has room for an answer that is too late, and nobody is there once the world has gone.
         if reached == 0 && !is_alive(self.reply.world_process_id) {
             return Err(Error::WorldGone(self.reply.world_process_id));
         }
+        self.summary.answered += 1;
+        self.open_from = self.pending.as_ref().map_or(0, |state| state.header.step.saturating_add(1));
         self.pending = None;
         self.is_complete = false;
         Ok(())

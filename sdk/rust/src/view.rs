@@ -82,6 +82,21 @@ struct Zone {
     is_resolved: bool,
 }
 
+/// What a run has been for a controller, as the controller saw it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Summary {
+    /// Step of the last state seen.
+    pub step: u64,
+    /// Simulated time of it, s.
+    pub time_s: f64,
+    /// Steps answered.
+    pub answered: u64,
+    /// Steps that passed without this controller between its answers.
+    pub skipped: u64,
+    /// Of the states seen, those before which the world had put something in for a controller that was late.
+    pub missed: u64,
+}
+
 /// One vehicle to be commanded: places in the state frame and in its zone's assignments.
 #[derive(Clone, Debug)]
 struct Member {
@@ -207,6 +222,12 @@ pub struct Step<'a> {
     pub time_s: f64,
     /// The whole state frame, all zones.
     pub states: &'a [VehicleState],
+    /// Whether the world put something in for a controller that was late in the step before.
+    pub missed: bool,
+    /// Steps that have passed without this controller since its last answer.
+    pub skipped: u64,
+    /// What this controller commanded for the step just ended, by vehicle, ascending.
+    pub(crate) commanded: &'a [(u32, f64)],
     pub(crate) run: &'a Run,
     pub(crate) board: &'a Board,
 }
@@ -219,12 +240,16 @@ impl<'a> Step<'a> {
 
     /// The vehicles to be commanded, in the order of the commands.
     pub fn vehicles(&self) -> impl Iterator<Item = Vehicle<'a>> + use<'a> {
-        let Step { run, states, board, .. } = *self;
+        let Step { run, states, board, commanded, .. } = *self;
         board.members.iter().map(move |member| {
             let zone = &board.zones[member.zone as usize];
             let bound = member.assignments.start as usize..member.assignments.end as usize;
+            let state = &states[member.at as usize];
+            let known = commanded.binary_search_by_key(&state.vehicle, |(vehicle, _)| *vehicle);
             Vehicle {
-                state: &states[member.at as usize],
+                state,
+                place: (member.at - member.slice.start) as usize,
+                commanded_mps2: known.ok().map(|at| commanded[at].1),
                 length_m: run.path(member.zone, member.path).map_or(f64::NAN, |a| a.spec.length_m),
                 assignments: &zone.assignments[bound.clone()],
                 partners: &zone.partners[bound],
@@ -239,6 +264,11 @@ impl<'a> Step<'a> {
 pub struct Vehicle<'a> {
     /// Where it is.
     pub state: &'a VehicleState,
+    /// Its place among [`zone_states`](Self::zone_states).
+    pub place: usize,
+    /// What this controller commanded it for the step just ended, m/s^2, if it did: `state.u_mps2` is what was applied,
+    /// and the rest is the shield's, or what the speed limit allowed.
+    pub commanded_mps2: Option<f64>,
     /// Length of its path, m.
     pub length_m: f64,
     /// Its constraints, as the coordinator sent them.
@@ -251,8 +281,10 @@ pub struct Vehicle<'a> {
 /// A vehicle that another must respect.
 #[derive(Clone, Copy, Debug)]
 pub struct Partner<'a> {
-    /// Its record in the same zone.
+    /// Its record in the same zone; its broadcast intent stands there too.
     pub state: &'a VehicleState,
+    /// Its place among the records of the zone.
+    pub place: usize,
     /// What is owed to it now.
     pub kind: PartnerKind,
     /// Its position in the vehicle's own coordinate, m.
@@ -275,6 +307,11 @@ pub enum PartnerKind {
 }
 
 impl<'a> Vehicle<'a> {
+    /// All records of its zone: those that have left it and still count, then the members.
+    pub fn zone_states(&self) -> &'a [VehicleState] {
+        self.slice
+    }
+
     /// Terminal speed to leave the zone with, m/s; `None` when it is free.
     pub fn terminal_mps(&self) -> Option<f64> {
         let a = self.assignments.first()?;
@@ -304,6 +341,7 @@ impl<'a> Vehicle<'a> {
             };
             Some(Partner {
                 state,
+                place: *place as usize,
                 kind,
                 x_m: state.x_m + a.own_conflict_m - a.partner_conflict_m,
                 conflict_m: a.own_conflict_m,
@@ -388,7 +426,8 @@ mod tests {
 
     fn seen(run: &Run, states: &[VehicleState], board: &Board) -> Vec<Found> {
         let header = FrameHeader::default();
-        let step = Step { header: &header, time_s: 0.0, states, run, board };
+        let (missed, skipped, commanded) = (false, 0, &[][..]);
+        let step = Step { header: &header, time_s: 0.0, states, missed, skipped, commanded, run, board };
         let partners = |v: &Vehicle<'_>| v.partners().map(|p| (p.state.vehicle, p.x_m)).collect();
         step.vehicles().map(|v| (v.state.vehicle, v.length_m, partners(&v))).collect()
     }
