@@ -33,6 +33,8 @@ pub enum EventKind {
     Refused,
     /// Somebody steered the run.
     Steered,
+    /// A controller's process ended, and the run goes on.
+    Exited,
 }
 
 impl EventKind {
@@ -48,6 +50,7 @@ impl EventKind {
             EventKind::Replaced => "replaced",
             EventKind::Refused => "refused",
             EventKind::Steered => "steered",
+            EventKind::Exited => "exited",
         }
     }
 }
@@ -252,6 +255,7 @@ impl<'a> Events<'a> {
                 RunEventKind::Refused => EventKind::Refused,
                 RunEventKind::Replaced => EventKind::Replaced,
                 RunEventKind::Steered => EventKind::Steered,
+                RunEventKind::Exited => EventKind::Exited,
             };
             let is_known = |known: &Event| {
                 known.kind == kind

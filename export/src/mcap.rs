@@ -125,7 +125,7 @@ pub fn write<S: Source>(path: &Path, reader: &Reader<S>) -> Result<Ended, OutErr
         let level = match event.kind {
             EventKind::Arrived | EventKind::Departed | EventKind::Steered => 2,
             EventKind::FeasibilityEnforcement | EventKind::Overruled | EventKind::Replaced => 3,
-            EventKind::Infeasible | EventKind::Late | EventKind::Refused => 4,
+            EventKind::Infeasible | EventKind::Late | EventKind::Refused | EventKind::Exited => 4,
         };
         let time_ns = (event.time_s * 1e9).round().max(0.0) as u64;
         let name = event.zone.map_or_else(|| "run".to_owned(), |zone| zone_name(scenario, zone));

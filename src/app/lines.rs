@@ -11,6 +11,8 @@ use serde::{Deserialize, Serialize};
 #[serde(rename_all = "snake_case")]
 pub(super) enum WorldLine {
     Progress(Position),
+    /// A controller that the run can do without has not answered for half as long as anybody waits: its index.
+    Silent(u32),
     Outcome(Box<Outcome>),
 }
 

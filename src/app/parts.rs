@@ -74,15 +74,17 @@ pub(super) fn world(args: &WorldArgs, traffic: Option<Box<dyn Traffic>>) -> Resu
         record_lag: args.conduct.record_lag(),
         is_steered: args.conduct.steering.steered,
         begins_paused: args.conduct.steering.begin_paused,
+        silent: if args.supervised.is_some() { tell_of_silence } else { |_| {} },
         run_id: Some(run_id),
     };
     let tell = report_to(args.supervised, &args.conduct.wait);
     let settling = settling(&args.conduct.wait, &*tell);
     if args.supervised.is_some() {
-        let mut last = Instant::now();
+        let mut last: Option<Instant> = None;
         let progress = |world: &World| {
-            if last.elapsed() >= REPORT_EVERY {
-                last = Instant::now();
+            // The first at once: it says that the run has begun.
+            if last.is_none_or(|last| last.elapsed() >= REPORT_EVERY) {
+                last = Some(Instant::now());
                 tell_supervisor(&WorldLine::progress(world));
             }
         };
@@ -189,6 +191,10 @@ pub(super) fn follow_supervisor(supervisor: Option<u32>) -> Result<(), AppError>
     // It may have died before the line above.
     let alive = getppid().is_some_and(|parent| parent.as_raw_nonzero().get() as u32 == supervisor);
     if alive { Ok(()) } else { Err(AppError::Interrupted("the supervisor has gone".to_owned())) }
+}
+
+fn tell_of_silence(controller: u32) {
+    tell_supervisor(&WorldLine::Silent(controller));
 }
 
 /// One line of JSON to the supervisor; if it has gone, a signal is under way.

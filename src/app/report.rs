@@ -3,7 +3,10 @@
 use super::say::number;
 use super::{AppError, print};
 use crate::lockstep::RefusedFrames;
-use crate::process::{LatencyBin, LatencyUs, Outcome, Punctuality, Replacement, Settled};
+use crate::process::{
+    DrivenBy, LatencyBin, LatencyUs, Outcome, PluginRow, Punctuality, Replacement, Settled,
+};
+use crate::record::RunEvent;
 use crate::scenario::{Demand, Road, Scenario, ShieldMode};
 use crate::world::{FaultCounts, OverlapSummary, ShieldSummary, Stall, TrafficSummary, ZoneSummaryRow};
 use comfy_table::{Cell, CellAlignment, Table, presets};
@@ -42,6 +45,8 @@ pub(super) struct Summary {
     replacements: Vec<Replacement>,
     refused: Vec<RefusedFrames>,
     late_frames: u64,
+    events: Vec<RunEvent>,
+    controllers: Vec<PluginRow>,
     #[serde(skip_serializing_if = "Option::is_none")]
     punctuality: Option<Punctuality>,
     placement: Vec<Settled>,
@@ -107,6 +112,8 @@ impl Summary {
             replacements: outcome.replacements,
             refused: outcome.refused,
             late_frames: outcome.late_frames,
+            events: outcome.events,
+            controllers: outcome.controllers,
             punctuality: outcome.punctuality,
             placement: outcome.placement,
             show_placement: false,
@@ -282,6 +289,7 @@ impl Summary {
         if let Some(p) = &self.punctuality {
             text.push_str(&punctuality_lines(p));
         }
+        self.controllers.iter().for_each(|row| text.push_str(&controller_line(row)));
         for r in &self.replacements {
             text.push_str(&format!(
                 "{} was replaced at step {} (generation {}); the step took {:.1} ms\n",
@@ -297,6 +305,28 @@ impl Summary {
         text.push_str(&format!("state hash {}\n", self.state_hash));
         text
     }
+}
+
+/// How a controller written elsewhere has fared.
+fn controller_line(row: &PluginRow) -> String {
+    let mut text = format!("controller {}: {} answered", row.controller, number(row.answered, "step"));
+    if let Some(t) = &row.answer_time_us {
+        text.push_str(&format!(
+            " in p50 {:.1} µs, p99 {:.1}, p99.9 {:.1}, max {:.1}",
+            t.p50, t.p99, t.p999, t.max
+        ));
+    }
+    if row.missed > 0 {
+        text.push_str(&format!("; {} missed", number(row.missed, "deadline")));
+    }
+    if row.exits > 0 {
+        let times = number(row.exits.into(), "time");
+        text.push_str(&format!("; it ended {times} (on_exit {})", row.on_exit.name()));
+        if row.driven_by != DrivenBy::Plugin {
+            text.push_str(&format!(", and {} drove its vehicles at the end", row.driven_by.name()));
+        }
+    }
+    text + "\n"
 }
 
 /// What a scenario's arrivals come from.

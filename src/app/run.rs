@@ -24,7 +24,7 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
     }
     let mut arguments = args.scenario.clone();
     arguments.set.extend(args.shield.iter().map(|mode| format!("shield={mode}")));
-    let (arguments, scenario) = controllers::load(&arguments, &args.controllers)?;
+    let (arguments, scenario) = controllers::load(&arguments, &args.controllers, &args.on_exit)?;
     let scenario = Arc::new(scenario);
     args.share.check(&scenario)?;
     if args.supervised.conduct.wait_mode == WaitMode::Spin && !args.in_process {

@@ -38,8 +38,8 @@ pub struct ControllerPool {
     starts: Vec<usize>,
     /// A zone's new members and constraints while they are put together; kept for their allocations.
     renewed: Renewed,
-    /// Paths of these zones that plug-ins drive.
-    plugged: Vec<(ZoneId, u32)>,
+    /// Paths of these zones that others drive.
+    others: Vec<(ZoneId, u32)>,
 }
 
 /// About as many records as [`AHEAD`] zones have.
@@ -84,15 +84,38 @@ impl Iterator for Partners<'_> {
 }
 
 impl ControllerPool {
-    /// A pool for the given zones.
+    /// A pool for the given zones, but for what plug-ins drive there.
     pub fn new(scenario: Arc<Scenario>, zones: Range<ZoneId>) -> ControllerPool {
+        let plugged = scenario.plugins.iter().flat_map(|p| p.paths.iter().copied());
+        let others = plugged.filter(|(zone, _)| zones.contains(zone)).collect();
+        ControllerPool::beside(scenario, zones, others)
+    }
+
+    /// A pool for what a plug-in was to drive.
+    ///
+    /// # Panics
+    /// When there is no such plug-in.
+    pub fn in_place_of(scenario: Arc<Scenario>, plugin: usize) -> ControllerPool {
+        let own = &scenario.plugins[plugin].paths;
+        let first = own.iter().map(|(zone, _)| *zone).min().unwrap_or(0);
+        let behind = own.iter().map(|(zone, _)| *zone + 1).max().unwrap_or(0);
+        let zones = first..behind;
+        let all = zones.clone().flat_map(|zone| {
+            let paths = scenario.network.zones[zone as usize].paths.len() as u32;
+            (0..paths).map(move |path| (zone, path))
+        });
+        let others = all.filter(|path| !own.contains(path)).collect();
+        ControllerPool::beside(scenario, zones, others)
+    }
+
+    /// A pool for these zones, but for paths that others drive.
+    fn beside(scenario: Arc<Scenario>, zones: Range<ZoneId>, others: Vec<(ZoneId, u32)>) -> ControllerPool {
         let count = zones.len();
         let mut lengths_m = Lists::new(count);
         for (place, zone) in zones.clone().enumerate() {
             let paths = &scenario.network.zones[zone as usize].paths;
             paths.iter().for_each(|path| lengths_m.push(place, path.length_m));
         }
-        let plugged = scenario.plugins.iter().flat_map(|p| p.paths.iter().copied());
         let mut kinds: Vec<crate::scenario::LawKind> = Vec::new();
         let law_of = zones.clone().map(|zone| {
             let kind = scenario.network.zones[zone as usize].law;
@@ -114,14 +137,14 @@ impl ControllerPool {
             schedules: Lists::new(count),
             starts: vec![0; count],
             renewed: Renewed::default(),
-            plugged: plugged.filter(|(zone, _)| zones.contains(zone)).collect(),
+            others,
             zones,
         }
     }
 
     /// The number of commands a state frame asks of this pool.
     pub fn command_count(&self, states: &[VehicleState]) -> usize {
-        self.own(states).iter().filter(|s| s.is_commanded() && !self.is_plugged(s)).count()
+        self.own(states).iter().filter(|s| s.is_commanded() && !self.is_anothers(s)).count()
     }
 
     /// Takes a coordination frame; assignments of other pools' zones are skipped.
@@ -268,7 +291,7 @@ impl ControllerPool {
                 lengths_m: &self.lengths_m[place],
                 constraints: &self.constraints[place],
                 schedules: &self.schedules[place],
-                plugged: &self.plugged,
+                others: &self.others,
                 kinds: self.kinds,
             };
             with(&self.laws[usize::from(self.law_of[place])], scene);
@@ -276,9 +299,9 @@ impl ControllerPool {
         Ok(())
     }
 
-    /// Whether a plug-in drives the vehicle.
-    fn is_plugged(&self, state: &VehicleState) -> bool {
-        is_plugged(&self.plugged, state)
+    /// Whether another drives the vehicle.
+    fn is_anothers(&self, state: &VehicleState) -> bool {
+        is_anothers(&self.others, state)
     }
 
     fn own_range(&self, states: &[VehicleState]) -> Range<usize> {
@@ -310,7 +333,7 @@ struct Scene<'a> {
     lengths_m: &'a [f64],
     constraints: &'a [Duty],
     schedules: &'a [Option<Schedule>],
-    plugged: &'a [(ZoneId, u32)],
+    others: &'a [(ZoneId, u32)],
     kinds: u16,
 }
 
@@ -327,7 +350,7 @@ impl Scene<'_> {
     #[inline(always)]
     fn each(&mut self, mut with: impl FnMut(&VehicleState, &Situation, Partners<'_>, &mut Member)) {
         for (at, (state, member)) in self.present.iter().zip(&mut *self.members).enumerate() {
-            if is_plugged(self.plugged, state) {
+            if is_anothers(self.others, state) {
                 continue;
             }
             let situation = Situation {
@@ -350,8 +373,8 @@ impl Scene<'_> {
     }
 }
 
-fn is_plugged(plugged: &[(ZoneId, u32)], state: &VehicleState) -> bool {
-    !plugged.is_empty() && plugged.contains(&(state.zone, state.path))
+fn is_anothers(others: &[(ZoneId, u32)], state: &VehicleState) -> bool {
+    !others.is_empty() && others.contains(&(state.zone, state.path))
 }
 
 /// The place of a zone's first record, or where it would be. Zones move little from frame to frame, so the

@@ -7,6 +7,7 @@
 //! with the present step and does all of it, whatever its predecessor had done of it; what was already
 //! there arrives twice and is the same.
 
+use crate::control::Words;
 use crate::coordination::{Audience, is_event};
 use crate::scenario::Scenario;
 use crate::step::Step;
@@ -74,6 +75,12 @@ pub struct Ledger {
     /// Each controller's commands of the step before, and of this one; empty before they have come.
     before: Vec<Vec<VehicleCommand>>,
     now: Vec<Vec<VehicleCommand>>,
+    /// Controllers, one bit each, whose commands of the step before, and of this one, hold the memory of one written
+    /// elsewhere: nobody of ours can go by it.
+    foreign_before: u64,
+    foreign_now: u64,
+    /// Number of controllers of the built-in pool.
+    pool: usize,
     /// Whether the present step has begun.
     has_begun: bool,
 }
@@ -84,6 +91,7 @@ impl Ledger {
         let network = &scenario.network;
         let zones = network.zones.len();
         let none = || vec![Vec::new(); controllers as usize];
+        let pool = (controllers as usize).saturating_sub(scenario.plugins.len());
         Ledger {
             audiences: (0..zones as u32).map(|zone| Audience::of(scenario, zone)).collect(),
             in_force: vec![Vec::new(); zones],
@@ -97,6 +105,9 @@ impl Ledger {
             spare: Vec::new(),
             before: none(),
             now: none(),
+            foreign_before: 0,
+            foreign_now: 0,
+            pool,
             has_begun: false,
         }
     }
@@ -132,10 +143,17 @@ impl Ledger {
         self.coordination.insert(at, (coordinator, copy));
     }
 
-    /// A controller's commands of this step, as they have been judged or put in; the vector comes back with
-    /// others to be written over.
-    pub fn command(&mut self, controller: usize, commands: &mut Vec<VehicleCommand>) {
+    /// A controller's commands of this step, as they have been judged; the vector comes back with others to be
+    /// written over. `stands_in` when it is one of ours in the place of one written elsewhere.
+    pub fn command(&mut self, controller: usize, commands: &mut Vec<VehicleCommand>, stands_in: bool) {
         std::mem::swap(&mut self.now[controller], commands);
+        self.foreign_now |= u64::from(controller >= self.pool && !stands_in) << controller;
+    }
+
+    /// Commands put in for a controller in this step, with the memory of those of the step before.
+    pub fn put_in(&mut self, controller: usize, commands: Vec<VehicleCommand>) {
+        self.now[controller] = commands;
+        self.foreign_now |= self.foreign_before & 1 << controller;
     }
 
     /// The step is over: what was sent in it is in force.
@@ -154,6 +172,7 @@ impl Ledger {
             std::mem::swap(before, now);
             now.clear();
         }
+        self.foreign_before = std::mem::take(&mut self.foreign_now);
     }
 
     /// What is in force in zones where it is news, zones ascending; it is none after this.
@@ -176,6 +195,8 @@ impl Ledger {
         for (index, part) in step.commands.iter().take(controllers).enumerate() {
             self.now[index].clone_from(&part.records);
         }
+        // Whoever it was: a run that goes on begins with those that it began with.
+        self.foreign_now = u64::MAX.checked_shl(self.pool as u32).unwrap_or(0);
         self.end();
     }
 
@@ -210,10 +231,20 @@ impl Ledger {
     fn to_controller(&self, controller: usize) -> Handover {
         Handover {
             coordination: self.coordination.clone(),
-            commands: self.commands_before(controller).to_vec(),
+            commands: self.memory_of(controller),
             in_force: self.in_force.concat(),
             ..Handover::default()
         }
+    }
+
+    /// A controller's commands of the step before, without what somebody else than ours remembered in them.
+    fn memory_of(&self, controller: usize) -> Vec<VehicleCommand> {
+        let mut commands = self.commands_before(controller).to_vec();
+        if self.foreign_before >> controller & 1 == 1 {
+            let Words { mode, words } = Words::ENTERED;
+            commands.iter_mut().for_each(|c| *c = VehicleCommand { mode, ..*c }.remembering(words));
+        }
+        commands
     }
 
     fn to_coordinator(&self) -> Handover {

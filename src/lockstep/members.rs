@@ -15,6 +15,8 @@ pub struct Seat {
     pub generation: u32,
     /// Who has it, where that is known; frames from others are refused then.
     pub process_id: Option<u32>,
+    /// Whether it is a controller of ours in the place of one written elsewhere, and so remembers as ours do.
+    pub stands_in: bool,
     /// The sending end that has proved to be that process's.
     origin: Option<u128>,
 }
@@ -22,7 +24,12 @@ pub struct Seat {
 impl Seat {
     /// A place taken for the `generation`th time.
     pub fn new(generation: u32, process_id: u32) -> Seat {
-        Seat { generation, process_id: Some(process_id), origin: None }
+        Seat { generation, process_id: Some(process_id), stands_in: false, origin: None }
+    }
+
+    /// The same, taken by a controller of ours in the place of one written elsewhere, or not.
+    pub fn standing_in(self, stands_in: bool) -> Seat {
+        Seat { stands_in, ..self }
     }
 
     /// Checks that a sending end belongs to whoever has the place. One that has been closed since belongs to

@@ -11,7 +11,7 @@ use crate::scenario::ControllerNames;
 use crate::scenario::share::zones_of;
 use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
-use crate::world::{Sheet, World};
+use crate::world::{PutIn, Sheet, World};
 use ipc_schemas::{
     Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, Member, Role, VehicleCommand,
     VehicleState, ZoneSummary,
@@ -57,6 +57,8 @@ where
     put_in: u64,
     /// The verdict of what was put in.
     put_in_verdict: u16,
+    /// Controllers nobody waits for any more: the world puts in what they do, as the shield allows.
+    abandoned: u64,
     observer: Option<Box<dyn Observer>>,
     /// The records of the state published last, for the observer.
     published: Vec<VehicleState>,
@@ -113,6 +115,7 @@ where
             header: FrameHeader::default(),
             put_in: 0,
             put_in_verdict: 0,
+            abandoned: 0,
             observer: None,
             published: Vec::new(),
             kept: KeptStep::default(),
@@ -198,23 +201,55 @@ where
     /// # Errors
     /// When the step cannot be ended.
     pub fn put_in(&mut self, verdict: u16) -> Result<bool, LockstepError> {
-        let (Phase::Collect(missing), Some(ledger)) = (self.phase, &mut self.ledger) else {
-            return Ok(false);
-        };
-        if missing.coordination != 0 {
+        let Phase::Collect(missing) = self.phase else { return Ok(false) };
+        if missing.coordination != 0 || self.ledger.is_none() {
             return Ok(false);
         }
-        for index in (0..self.controllers.len()).filter(|i| missing.commands >> i & 1 == 1) {
-            let mut commands = self.world.substitute(index as u32, ledger.commands_before(index), verdict);
-            self.world.put_in(index as u32, &commands).expect(
-                "what the world puts in has each of the controller's vehicles once, within its limits",
-            );
-            ledger.command(index, &mut commands);
-        }
+        self.put_in_for(missing.commands, PutIn::Held(verdict));
         self.put_in = missing.commands;
         self.put_in_verdict = verdict;
         self.finish_step()?;
         Ok(true)
+    }
+
+    /// Puts in commands for these controllers.
+    fn put_in_for(&mut self, controllers: u64, put_in: PutIn) {
+        let Some(ledger) = &mut self.ledger else { return };
+        for index in (0..self.controllers.len()).filter(|i| controllers >> i & 1 == 1) {
+            let commands = self.world.substitute(index as u32, ledger.commands_before(index), put_in);
+            self.world.put_in(index as u32, &commands).expect(
+                "what the world puts in has each of the controller's vehicles once, within its limits",
+            );
+            ledger.put_in(index, commands);
+        }
+    }
+
+    /// Goes on without a controller from this step on: its vehicles make for their speed limits, as far as the shield
+    /// allows. Nobody was late, so the others have nothing to take over anew. Needs the ledger.
+    pub fn abandon(&mut self, controller: u32) {
+        self.abandoned |= 1 << controller;
+    }
+
+    /// Sends the state of the step at hand once more, for whoever has just taken a place and was not there when it was
+    /// sent; to the others it is nothing new.
+    ///
+    /// # Errors
+    /// The transport's.
+    pub fn send_state_again(&mut self) -> Result<(), LockstepError> {
+        if let Phase::Collect(_) = self.phase {
+            let world = &self.world;
+            let loan = self.ports.state.loan(self.header, world.record_count(), |slots| {
+                world.records().for_each(|record| slots.push(record));
+            })?;
+            loan.send()?;
+        }
+        Ok(())
+    }
+
+    /// The controllers whose commands of the step at hand have not come, one bit each.
+    #[inline]
+    pub fn missing_commands(&self) -> u64 {
+        if let Phase::Collect(missing) = self.phase { missing.commands } else { 0 }
     }
 
     /// What the controllers of the run are called.
@@ -240,6 +275,10 @@ where
     /// Gives a place to a process; frames its predecessor has left are refused from now on. Returns whether it
     /// had not had it.
     pub fn seat(&mut self, role: Role, index: u32, seat: Seat) -> bool {
+        if role == Role::Controller {
+            // Whoever comes back is waited for again.
+            self.abandoned &= !(1 << index);
+        }
         let seats = if role == Role::Coordinator { &mut self.coordinators } else { &mut self.controllers };
         let who = |seat: &Seat| (seat.generation, seat.process_id);
         let place = seats.get_mut(index as usize).filter(|place| who(place) != who(&seat));
@@ -379,6 +418,11 @@ where
 
     fn collect(&mut self, mut missing: Missing) -> Result<Progress, LockstepError> {
         let mut progress = missing.coordination != 0 && self.take_coordination(&mut missing)?;
+        if missing.commands & self.abandoned != 0 && missing.coordination == 0 {
+            self.put_in_for(missing.commands & self.abandoned, PutIn::ToLimit);
+            missing.commands &= !self.abandoned;
+            progress = true;
+        }
         if missing.commands != 0 {
             progress |= self.take_command(&mut missing)?;
         }
@@ -449,7 +493,8 @@ where
                 Ok(()) => {
                     missing.commands &= !(1 << header.sender_index);
                     if let Some(ledger) = &mut self.ledger {
-                        ledger.command(usize::from(header.sender_index), &mut self.judged);
+                        let index = usize::from(header.sender_index);
+                        ledger.command(index, &mut self.judged, self.controllers[index].stands_in);
                     }
                     return Ok(true);
                 }

@@ -7,7 +7,7 @@ use super::{Peer, Peers, ProcessError, StopFlag, WaitMode};
 use crate::encoding;
 use crate::lockstep::{Handover, Seat};
 use crate::own_time::Bound;
-use crate::scenario::{Drivers, Scenario, decode, scenario_hash};
+use crate::scenario::{Drivers, OnExit, Scenario, decode, scenario_hash};
 use crate::transport::TransportError;
 use crate::transport::iox::{AttachLine, AttachServer, Bells, RunName, RunSpace, SpaceError};
 use ipc_schemas::{self as frames, AttachReply, AttachRequest, Role, schema_hash};
@@ -264,11 +264,18 @@ impl Reception {
             .map(|(index, _)| plugin_bytes(scenario, &drivers, index))
             .collect();
         let names = scenario.plugins.iter().map(|plugin| plugin.name_hash()).collect();
+        let mut seating =
+            Seating::new(scenario_hash(scenario), coordinators as usize, controllers as usize, names);
+        for (plugin, _) in
+            scenario.plugins.iter().enumerate().filter(|(_, plugin)| plugin.on_exit == OnExit::Builtin)
+        {
+            seating.let_stand_in(plugin);
+        }
         let longest = plugins.iter().map(Vec::len).max().unwrap_or(0).max(bytes.len());
         let hash = scenario_hash(scenario);
         Ok(Reception {
             server: space.create_attach_server((coordinators + controllers) as usize, longest)?,
-            seating: Seating::new(hash, coordinators as usize, controllers as usize, names),
+            seating,
             plugins,
             first_step: 0,
             pending: Vec::new(),
@@ -329,7 +336,8 @@ impl Reception {
             return Ok(());
         };
         let joins = request.phase == frames::ATTACH_JOIN;
-        let seat = Seat::new(generation, request.process_id);
+        let stands_in = role == Role::Controller && self.seating.is_stood_in(index as usize);
+        let seat = Seat::new(generation, request.process_id).standing_in(stands_in);
         let handed = if joins { Readiness::Begin } else { hand_over(role, index, seat) };
         match handed {
             _ if joins => self.server.reply(reply, plugin.map_or(&self.scenario, |p| &self.plugins[p])),
@@ -375,14 +383,22 @@ impl Reception {
         self.seating.places(Role::Controller)[controller].occupant.is_some_and(|o| o.ready)
     }
 
+    /// The places as they are taken before the run begins.
+    pub(super) fn seats(&self) -> impl Iterator<Item = (Role, u32, Seat)> {
+        self.peers().0.into_iter().map(|Peer { role, index, process_id }| {
+            let stands_in = role == Role::Controller && self.seating.is_stood_in(index as usize);
+            (role, index, Seat::new(0, process_id).standing_in(stands_in))
+        })
+    }
+
     /// Frees the place of a controller that has been ended.
     pub(super) fn vacate(&mut self, controller: usize) {
         self.seating.vacate(controller);
     }
 
-    /// Whether a controller is a plug-in.
-    pub(super) fn is_plugin(&self, controller: usize) -> bool {
-        controller >= self.seating.pool()
+    /// Whether one of ours has the place of a controller written elsewhere.
+    pub(super) fn is_stood_in(&self, controller: usize) -> bool {
+        self.seating.is_stood_in(controller)
     }
 
     /// The generation of a controller.

@@ -3,11 +3,13 @@
 use super::attach::{Readiness, Reception};
 use super::outcome::Events;
 use super::pace::Pacer;
+use super::plugin_log::PluginLog;
 use super::services::{Driver, MembersOutbox};
 use super::viewing::Viewing;
 use super::{OnMiss, Peer, Peers, ProcessError, Replacement, StopFlag, Waiter};
 use crate::lockstep::Awaited;
 use crate::record::RunEventKind;
+use crate::scenario::OnExit;
 use crate::trace::{self, Phase};
 use ipc_schemas::Role;
 use std::time::Duration;
@@ -36,8 +38,18 @@ pub(super) struct Membership {
     pub events: Events,
     /// Who has died last and was not replaced yet.
     pub gone: Option<Peer>,
+    /// Who has been given a place and not what it needs to begin.
+    pub coming: Vec<(Role, u32)>,
     /// Who has come since the last step ended.
     pub arrived: Vec<(Peer, u32)>,
+    /// How controllers written elsewhere have fared.
+    pub plugins: PluginLog,
+    /// Told of one that has not answered for too long.
+    pub silent: fn(u32),
+    /// How long that is.
+    pub silence: Duration,
+    /// The step at which it was.
+    pub told_of_silence: Option<u64>,
 }
 
 impl Membership {
@@ -86,12 +98,17 @@ impl Membership {
                 }
                 policy => self.overdue = policy.verdict(),
             }
+            // Waits that are this short end before anybody looks after the others.
+            if let Some(peer) = self.reception.peers().first_gone().filter(|peer| self.is_survived(*peer)) {
+                self.lose(driver, waiter, peer);
+            }
         }
         // While a coordinator is missing too, there is nothing the vehicles could go by.
         if let Some(verdict) = self.overdue
             && driver.put_in(verdict)?
         {
             self.overdue = None;
+            self.plugins.gave_up();
             return Ok(());
         }
         if driver.expects_requests() {
@@ -108,11 +125,12 @@ impl Membership {
                 return Err(ProcessError::Faulty { who, fault: fault.clone() });
             }
         }
+        if waiter.waited() >= self.silence {
+            self.report_silence(awaited);
+        }
         match (waiter.wait(awaited, self.pacer.time_left()), self.gone) {
-            (Err(ProcessError::PeerGone { peer, .. }), _) if self.may_be_replaced(peer) => {
-                self.gone = Some(peer);
-                let others = self.reception.peers().0.into_iter().filter(|p| *p != peer);
-                waiter.set_peers(Peers(others.collect()));
+            (Err(ProcessError::PeerGone { peer, .. }), _) if self.is_survived(peer) => {
+                self.lose(driver, waiter, peer);
                 Ok(())
             }
             (Err(ProcessError::Timeout { awaited, seconds }), Some(peer)) => {
@@ -124,9 +142,57 @@ impl Membership {
         }
     }
 
-    fn may_be_replaced(&self, peer: Peer) -> bool {
-        let is_plugin = peer.role == Role::Controller && self.reception.is_plugin(peer.index as usize);
-        self.replace && !is_plugin
+    /// What is to become of the vehicles of a controller written elsewhere, as long as it drives them itself.
+    fn on_exit(&self, peer: Peer) -> Option<OnExit> {
+        let drives = peer.role == Role::Controller && !self.reception.is_stood_in(peer.index as usize);
+        self.plugins.on_exit(peer.index).filter(|_| drives)
+    }
+
+    /// Whether the run goes on without this process, or waits for another in its place.
+    fn is_survived(&self, peer: Peer) -> bool {
+        self.on_exit(peer).map_or(self.replace, |choice| choice != OnExit::End)
+    }
+
+    /// Says, once a step, which controllers do not answer that the run can do without; that such a one is ended is
+    /// noticed as any other end is.
+    fn report_silence(&mut self, awaited: Awaited) {
+        if awaited.role != Role::Controller || self.told_of_silence == Some(awaited.step) {
+            return;
+        }
+        self.told_of_silence = Some(awaited.step);
+        for index in (0..64).filter(|index| awaited.missing >> index & 1 == 1) {
+            let peer = Peer { role: Role::Controller, index, process_id: 0 };
+            if self.on_exit(peer).is_some_and(|choice| choice != OnExit::End) {
+                (self.silent)(index);
+            }
+        }
+    }
+
+    /// A process is no longer there, which the run survives.
+    fn lose(&mut self, driver: &mut Driver, waiter: &mut Waiter, peer: Peer) {
+        if let Some(choice) = self.on_exit(peer) {
+            let Peer { index, process_id, .. } = peer;
+            let what = match choice {
+                OnExit::ShieldFallback => "the shield drives its vehicles from this step on",
+                OnExit::Builtin => "the built-in law is to drive its vehicles",
+                OnExit::End | OnExit::Restart => "the run waits for it to be started again",
+            };
+            let text = format!("{} (process {process_id}) is gone: {what}", peer.name(&driver.names()));
+            self.events.say(driver.world().step(), RunEventKind::Exited, text, 1 << index);
+            self.plugins.exited(index);
+            // Whoever comes has as long as anybody.
+            waiter.reset();
+            self.reception.vacate(index as usize);
+            if choice == OnExit::ShieldFallback {
+                driver.abandon(index);
+            } else {
+                self.gone = Some(peer);
+            }
+        } else {
+            self.gone = Some(peer);
+        }
+        let others = self.reception.peers().0.into_iter().filter(|p| *p != peer);
+        waiter.set_peers(Peers(others.collect()));
     }
 
     /// Shows steps to whoever looks, while others work on the one that has just been published.
@@ -144,23 +210,31 @@ impl Membership {
 
     /// Sees to whoever has come.
     pub(super) fn attend(&mut self, driver: &mut Driver, waiter: &mut Waiter) -> Result<(), ProcessError> {
-        let Membership { reception, members, arrived, gone, .. } = self;
+        let Membership { reception, members, coming, arrived, gone, plugins, .. } = self;
         reception.go_on_from(driver.world().step());
         let before = arrived.len();
         let step = driver.world().step();
         let mut told = Ok(());
+        let mut was_not_there = false;
         reception.serve(&mut |role, index, seat| {
             if driver.seat(role, index, seat) {
                 // Before it is answered, and so before it can send anything.
                 told = members.tell(step, driver.members());
+                coming.push((role, index));
             }
             let Some(handover) = driver.handover(role, index) else { return Readiness::Later };
-            if let Some(process_id) = seat.process_id {
+            // Others ask for what they have missed.
+            let comes = coming.iter().position(|place| *place == (role, index));
+            if let (Some(at), Some(process_id)) = (comes, seat.process_id) {
+                coming.swap_remove(at);
                 let peer = Peer { role, index, process_id };
-                if seat.generation > 0 {
-                    trace::note(|| format!("{peer} has been replaced, generation {}", seat.generation));
-                }
+                let name = peer.name(&driver.names());
+                trace::note(|| format!("{name} has been replaced, generation {}", seat.generation));
                 arrived.push((peer, seat.generation));
+                if role == Role::Controller && plugins.on_exit(index).is_some() {
+                    plugins.taken(index, seat.generation, seat.stands_in);
+                    was_not_there |= !seat.stands_in;
+                }
             }
             Readiness::Now(Box::new(handover))
         })?;
@@ -168,6 +242,10 @@ impl Membership {
         if arrived.len() > before {
             *gone = None;
             waiter.set_peers(reception.peers());
+        }
+        if was_not_there {
+            // It keeps its memory to itself, and has no state to begin with.
+            driver.send_state_again()?;
         }
         Ok(())
     }
@@ -181,13 +259,18 @@ impl Membership {
         let step = self.reception.first_step;
         let step_ms = ns as f64 / 1e6;
         self.events.refused(step, driver.refused_senders(), || driver.refused());
+        let names = driver.names();
         for (peer, generation) in self.arrived.iter().filter(|(_, generation)| *generation > 0) {
-            let text = format!("{peer} was replaced: generation {generation}");
+            let by = match peer.role == Role::Controller && self.reception.is_stood_in(peer.index as usize) {
+                true => " by the built-in law",
+                false => "",
+            };
+            let text = format!("{} was replaced{by}: generation {generation}", peer.name(&names));
             let controllers = if peer.role == Role::Controller { 1 << peer.index } else { 0 };
             self.events.say(step, RunEventKind::Replaced, text, controllers);
         }
         self.arrived.drain(..).filter(|(_, generation)| *generation > 0).map(move |(peer, generation)| {
-            Replacement { participant: peer.to_string(), generation, step, step_ms }
+            Replacement { participant: peer.name(&names), generation, step, step_ms }
         })
     }
 }

@@ -1,6 +1,6 @@
 //! What a run comes to: its results, and how long its steps took.
 
-use super::{Punctuality, Settled};
+use super::{PluginRow, Punctuality, Settled};
 use crate::lockstep::{Awaited, RefusedFrames};
 use crate::record::{RunEvent, RunEventKind};
 use crate::scenario::ControllerNames;
@@ -59,6 +59,9 @@ pub struct Outcome {
     /// What happened to the run beside its steps, in order: the first thousand of it.
     #[serde(default)]
     pub events: Vec<RunEvent>,
+    /// How controllers written elsewhere have fared.
+    #[serde(default)]
+    pub controllers: Vec<PluginRow>,
     /// How punctual the run was, where it had a schedule or deadlines.
     pub punctuality: Option<Punctuality>,
     /// Where each process was and what it was granted; filled in by who started them.
@@ -195,6 +198,7 @@ impl StepMeter {
             refused: history.refused,
             late_frames: history.late_frames,
             events: history.events,
+            controllers: history.controllers,
             punctuality: history.punctuality,
             placement: Vec::new(),
         }
@@ -218,6 +222,7 @@ pub(super) struct History {
     pub refused: Vec<RefusedFrames>,
     pub late_frames: u64,
     pub events: Vec<RunEvent>,
+    pub controllers: Vec<PluginRow>,
     pub punctuality: Option<Punctuality>,
 }
 

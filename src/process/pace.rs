@@ -249,6 +249,12 @@ impl Pacer {
         true
     }
 
+    /// How many deadlines a participant has missed.
+    pub fn missed_by(&self, role: Role, index: u32) -> u64 {
+        let its = self.missed_by.iter().find(|(r, i, _)| (*r, *i) == (role, index));
+        its.map_or(0, |(.., steps)| *steps)
+    }
+
     /// How punctual the run was; `None` where nothing was asked for.
     pub fn report(&self, names: &ControllerNames) -> Option<Punctuality> {
         if self.timing.pace == Pace::Free && self.timing.deadline.is_none() {

@@ -91,7 +91,10 @@ pub fn run_controller(run: &RunName, conduct: Conduct<'_>) -> Result<(), Process
                 .ringing(rope_of(&attachment.bells, *wait, Role::World, 0)),
             members: joined.members()?,
         };
-    let role = ControllerPool::new(scenario.clone(), zones_of(zones, index, pool));
+    let role = match index.checked_sub(pool) {
+        None => ControllerPool::new(scenario.clone(), zones_of(zones, index, pool)),
+        Some(plugin) => ControllerPool::in_place_of(scenario.clone(), plugin as usize),
+    };
     let driver = ControllerDriver::new(role, ports, joined.identity(), first_step);
     joined.drive(driver, conduct.peer_timeout, ControllerDriver::refused)
 }

@@ -15,6 +15,8 @@ pub struct Seating {
     pool: usize,
     /// Name hash of each plug-in; they have the places behind the pool, in this order.
     plugins: Vec<u64>,
+    /// Whose place a controller of ours may take, of the plug-ins.
+    may_stand_in: Vec<bool>,
     /// Whether the run has begun.
     under_way: bool,
 }
@@ -37,6 +39,8 @@ pub struct Occupant {
     pub process_id: u32,
     /// Whether it has said that it is ready.
     pub ready: bool,
+    /// Whether it is a controller of ours in the place of a plug-in.
+    pub stands_in: bool,
 }
 
 /// What becomes of a request.
@@ -81,9 +85,20 @@ impl Seating {
             coordinators: vec![Place::default(); coordinators],
             controllers: vec![Place::default(); controllers],
             pool,
+            may_stand_in: vec![false; plugins.len()],
             plugins,
             under_way: false,
         }
+    }
+
+    /// A controller of ours may take the place of this plug-in, once nobody has it; it asks for it by its index.
+    pub fn let_stand_in(&mut self, plugin: usize) {
+        self.may_stand_in[plugin] = true;
+    }
+
+    /// Whether the place of a controller is taken by one of ours in the place of a plug-in.
+    pub fn is_stood_in(&self, controller: usize) -> bool {
+        self.controllers[controller].occupant.is_some_and(|o| o.stands_in)
     }
 
     /// The run has begun: from now on whoever comes takes somebody's place.
@@ -145,7 +160,13 @@ impl Seating {
                 Some(known.ok_or(frames::ATTACH_NO_CONTROLLER)?)
             }
         };
-        let (first, places) = match (role, plugin) {
+        let pool = self.pool;
+        let stands_in =
+            (role == Role::Controller && plugin.is_none() && request.wanted_index != frames::ANY_INDEX)
+                .then(|| usize::from(request.wanted_index).checked_sub(pool))
+                .flatten()
+                .filter(|plugin| self.may_stand_in.get(*plugin).is_some_and(|may| *may));
+        let (first, places) = match (role, plugin.or(stands_in)) {
             (Role::Coordinator, _) => (0, &mut self.coordinators[..]),
             (_, None) => (0, &mut self.controllers[..self.pool]),
             (_, Some(plugin)) => {
@@ -169,7 +190,8 @@ impl Seating {
         let place = &mut places[at];
         if is_newcomer {
             let AttachRequest { instance, process_id, .. } = *request;
-            place.occupant = Some(Occupant { instance, process_id, ready: false });
+            let stands_in = stands_in.is_some();
+            place.occupant = Some(Occupant { instance, process_id, ready: false, stands_in });
             place.generation += u32::from(self.under_way);
         }
         if let Some(occupant) = place.occupant.as_mut().filter(|_| !joins) {
@@ -234,6 +256,34 @@ mod tests {
             assert_eq!(judged, Judgement::Refused(frames::ATTACH_BAD_PHASE));
         }
         assert!(!seating.places(Role::Controller)[0].occupant.is_some_and(|o| o.ready));
+    }
+
+    #[test]
+    fn one_of_ours_takes_the_place_of_a_plug_in_only_where_it_may_and_once_that_has_died() {
+        let mut seating = Seating::new(1, 1, 3, vec![77, 78]);
+        let named = AttachRequest { controller: 78, ..request(Role::Controller, frames::ATTACH_JOIN) };
+        let at = |index, plugin| Judgement::Seated { role: Role::Controller, index, generation: 0, plugin };
+        assert_eq!(seating.judge(&named, ALL_LIVE), at(2, Some(1)));
+        let ours = |wanted_index| AttachRequest {
+            instance: 6,
+            process_id: 200,
+            wanted_index,
+            ..request(Role::Controller, frames::ATTACH_JOIN)
+        };
+        let no_room = Judgement::Refused(frames::ATTACH_NO_ROOM);
+        assert_eq!(seating.judge(&ours(2), |id| id != 100), no_room, "nobody has said that it may");
+        seating.let_stand_in(1);
+        assert_eq!(seating.judge(&ours(2), ALL_LIVE), no_room, "it is taken");
+        assert_eq!(seating.judge(&ours(1), ALL_LIVE), no_room, "another's");
+        seating.begin();
+        let taken = Judgement::Seated { role: Role::Controller, index: 2, generation: 1, plugin: None };
+        assert_eq!(seating.judge(&ours(2), |id| id != 100), taken);
+        assert!(seating.is_stood_in(2));
+        // Whoever has no wish gets a place of the pool's.
+        assert_eq!(
+            seating.judge(&AttachRequest { instance: 7, ..ours(frames::ANY_INDEX) }, |id| id != 200),
+            { Judgement::Seated { role: Role::Controller, index: 0, generation: 1, plugin: None } }
+        );
     }
 
     #[test]

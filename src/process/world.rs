@@ -7,14 +7,15 @@ use super::outcome::{Events, History, Outcome, StepMeter};
 use super::pace::Pacer;
 use super::peers::is_alive;
 use super::placement::number_of_cores;
+use super::plugin_log::PluginLog;
 use super::services::{Driver, Services, coordinator_ropes, expected_vehicles};
 use super::viewing::{Steering, Viewing};
 use super::{Patience, Peer, ProcessError, RecordLag, Settling, StopFlag, Timing, WaitMode, Waiter};
 use crate::lockstep::in_process::InProcess;
-use crate::lockstep::{Handover, Ledger, Progress, Seat, WorldDriver};
+use crate::lockstep::{Handover, Ledger, Progress, WorldDriver};
 use crate::own_time::Bound;
 use crate::record::{FileSource, Processes, Reader, ReplayError, replay_world};
-use crate::scenario::Scenario;
+use crate::scenario::{OnExit, Scenario};
 use crate::step::StepFrames;
 use crate::trace::{self, Phase};
 use crate::transport::iox::{RunName, RunSpace, SpaceError};
@@ -51,14 +52,21 @@ pub struct WorldOptions {
     pub is_steered: bool,
     /// Whether it begins paused, as long as it waits for participants at most, until somebody who looks lets it go on.
     pub begins_paused: bool,
+    /// Told of a controller (its index) that has not answered for half of `peer_timeout` and that the run can do
+    /// without; it is to end it.
+    pub silent: fn(u32),
     /// The run's id, where it has been chosen already.
     pub run_id: Option<u64>,
 }
 
 impl WorldOptions {
     /// Whether the world keeps what others need who take a place, or catch up.
-    fn keeps(&self) -> bool {
-        self.replace || self.observed || self.is_steered || self.timing.on_miss.verdict().is_some()
+    fn keeps(&self, scenario: &Scenario) -> bool {
+        scenario.plugins.iter().any(|plugin| plugin.on_exit != OnExit::End)
+            || self.replace
+            || self.observed
+            || self.is_steered
+            || self.timing.on_miss.verdict().is_some()
     }
 }
 
@@ -141,7 +149,7 @@ pub fn run_world(
     };
     let first_step = world.step();
     let mut ledger =
-        (options.keeps() || resume.is_some()).then(|| Ledger::new(scenario, options.controllers));
+        (options.keeps(scenario) || resume.is_some()).then(|| Ledger::new(scenario, options.controllers));
     let mut missed = false;
     // Behind these the file may be cut off.
     for step in resume.iter().flat_map(|(reader, _)| reader.steps().take(first_step as usize)) {
@@ -216,10 +224,11 @@ pub fn run_world(
     let waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
     let mut waiter = waiter.waking(coordinator_ropes(&bells, wait, coordinators));
     waiter.call(driver.names());
-    for Peer { role, index, process_id } in reception.peers().0 {
-        driver.seat(role, index, Seat::new(0, process_id));
+    for (role, index, seat) in reception.seats() {
+        driver.seat(role, index, seat);
     }
     members.tell(first_step, driver.members())?;
+    let scenario_pool = driver.world().drivers().pool();
     let mut membership = Membership {
         reception,
         members,
@@ -229,8 +238,18 @@ pub fn run_world(
         events: Events::default(),
         overdue: None,
         gone: None,
+        coming: Vec::new(),
         arrived: Vec::new(),
+        plugins: PluginLog::new(scenario, scenario_pool),
+        silent: options.silent,
+        // Sooner than others lose patience with the world.
+        silence: options.peer_timeout / 2,
+        told_of_silence: None,
     };
+    for (_, index, _) in membership.reception.seats().filter(|(.., seat)| seat.stands_in) {
+        // Its process ended before the run began.
+        membership.plugins.taken(index, 0, true);
+    }
     if options.begins_paused && options.is_steered {
         membership.pacer.steer(Steering::Pause, first_step);
     }
@@ -250,6 +269,8 @@ pub fn run_world(
                 // Nobody else waits for them any more.
                 waiter.wake(u64::MAX);
                 history.punctuality = membership.pacer.report(&driver.names());
+                history.controllers =
+                    membership.plugins.report(|index| membership.pacer.missed_by(Role::Controller, index));
                 history.refused = driver.refused();
                 history.late_frames = driver.late_frames();
                 history.events = membership.events.take();
@@ -266,8 +287,10 @@ pub fn run_world(
             Progress::Advanced => waiter.reset(),
         }
         if publishes {
+            membership.plugins.asked(driver.missing_commands());
             membership.overlap_views(&mut driver)?;
         }
+        membership.plugins.still_missing(driver.missing_commands());
         if driver.world().step() == step {
             continue;
         }

@@ -319,6 +319,8 @@ pub enum RunEventKind {
     Replaced,
     /// Somebody steered the run.
     Steered,
+    /// A controller's process ended in the middle of the run, which goes on.
+    Exited,
 }
 
 /// How a recorded run ended.

@@ -295,7 +295,9 @@ impl WorldReplay {
         }
         world.coordinate(&step.coordination);
         for (index, part) in (0..).zip(&step.commands) {
-            let taken = match step.missed(index as usize) {
+            // For whom nobody waits any more the world puts in commands, and nobody has missed anything.
+            let is_put_in = part.records.iter().any(|c| c.verdict > ipc_schemas::VERDICT_INFEASIBLE);
+            let taken = match is_put_in || step.missed(index as usize) {
                 true => world.put_in(index, &part.records),
                 false => world.command(index, &part.records),
             };

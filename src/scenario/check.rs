@@ -274,7 +274,8 @@ fn demand(demand: &Demand, vehicle: &VehicleParams, routes: usize) -> Check {
 #[allow(clippy::unwrap_used)]
 mod tests {
     use crate::scenario::{
-        Faults, Override, Scenario, SensorKind, decode, embedded_names, encode, load, load_embedded,
+        Faults, OnExit, Override, Plugin, Scenario, SensorKind, decode, embedded_names, encode, load,
+        load_embedded,
     };
 
     #[test]
@@ -323,7 +324,7 @@ mod tests {
             },
             |s| {
                 let paths = vec![(7, 0)];
-                s.plugins = vec![crate::scenario::Plugin { name: "p".into(), paths, command: None }];
+                s.plugins = vec![Plugin { name: "p".into(), paths, command: None, on_exit: OnExit::End }];
             },
             |s| s.faults = Some(Faults::default()),
             |s| faults(s).noise.as_mut().unwrap().position_sd_m = -1.0,

@@ -414,6 +414,12 @@ pub(in crate::scenario) static CONTROLLERS: Keys = &[
     &other("zones", "list of names", "none", "zones it drives, with all their paths"),
     &other("paths", "list of `\"ZONE.PATH\"`", "none", "single paths it drives"),
     &other("command", "text", "started by hand", "command line that starts it"),
+    &other(
+        "on_exit",
+        "`\"end\"`, `\"restart\"`, `\"builtin\"` or `\"shield-fallback\"`",
+        "`\"end\"`",
+        "what becomes of its vehicles when its process ends in the middle of a run ([plug-ins](plugins.md))",
+    ),
 ];
 
 // [faults]

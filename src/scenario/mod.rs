@@ -44,7 +44,7 @@ pub use params::{
     ControlParams, CoordinationParams, FeConditions, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
     ScheduleKind, Solver, VehicleKind, VehicleParams, ViableParams,
 };
-pub use plugins::{ControllerNames, Drivers, Plugin, ShieldMode, declaration, target_and_command};
+pub use plugins::{ControllerNames, Drivers, OnExit, Plugin, ShieldMode, declaration, target_and_command};
 
 use serde::{Deserialize, Serialize};
 

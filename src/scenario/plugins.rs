@@ -13,6 +13,44 @@ pub struct Plugin {
     pub paths: Vec<(ZoneId, u32)>,
     /// Command line with which `cz run` starts it; absent when somebody else does.
     pub command: Option<String>,
+    /// What becomes of its vehicles when its process ends in the middle of the run.
+    #[serde(default)]
+    pub on_exit: OnExit,
+}
+
+/// What becomes of the vehicles of a controller written elsewhere when its process ends in the middle of a run.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum OnExit {
+    /// The run ends with it.
+    #[default]
+    End,
+    /// The run waits until it has been started again.
+    Restart,
+    /// The run waits for a controller of ours, which drives them from then on.
+    Builtin,
+    /// They make for their speed limits from then on, as far as the shield allows.
+    ShieldFallback,
+}
+
+impl OnExit {
+    /// All of them.
+    pub const ALL: [OnExit; 4] = [OnExit::End, OnExit::Restart, OnExit::Builtin, OnExit::ShieldFallback];
+
+    /// The word for it in scenarios, on the command line and in summaries.
+    pub fn name(self) -> &'static str {
+        match self {
+            OnExit::End => "end",
+            OnExit::Restart => "restart",
+            OnExit::Builtin => "builtin",
+            OnExit::ShieldFallback => "shield-fallback",
+        }
+    }
+
+    /// The one of that name.
+    pub fn of(name: &str) -> Option<OnExit> {
+        OnExit::ALL.into_iter().find(|choice| choice.name() == name)
+    }
 }
 
 impl Plugin {

@@ -123,6 +123,28 @@ const LEAST_EXIT_MPS: f64 = 5.0;
 /// How it does, m/s^2.
 const EXIT_MPS2: f64 = 2.0;
 
+/// What the world has vehicles do in place of their controller.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PutIn {
+    /// Each holds the acceleration it had, as far as the speed limits allow, on the terms of this verdict.
+    Held(u16),
+    /// Each makes for its speed limit as far as the shield allows: holding on for ever, whoever has had to brake would
+    /// stand for ever.
+    ToLimit,
+}
+
+impl PutIn {
+    fn verdict(self) -> u16 {
+        match self {
+            PutIn::Held(verdict) => verdict,
+            PutIn::ToLimit => frames::VERDICT_FALLBACK,
+        }
+    }
+}
+
+/// A vehicle that makes for its speed limit comes nearer to it with this time constant, s.
+const DRIVE_ON_S: f64 = 2.0;
+
 /// The gateway's configuration and what it has counted.
 #[derive(Debug)]
 pub(super) struct Gateway {
@@ -297,13 +319,12 @@ impl World {
     }
 
     /// What to command in place of a controller that has not answered, in the order of its frames: each
-    /// vehicle holds the acceleration it had, as far as the speed limits allow, and keeps what its controller
-    /// `remembered` of it in the step before. `verdict` says on which terms.
+    /// vehicle does as `put_in` says, and keeps what its controller `remembered` of it in the step before.
     pub fn substitute(
         &self,
         controller: u32,
         remembered: &[VehicleCommand],
-        verdict: u16,
+        put_in: PutIn,
     ) -> Vec<VehicleCommand> {
         let dt_s = self.scenario.dt_s();
         let memories: HashMap<(u32, u32), &VehicleCommand> =
@@ -320,12 +341,16 @@ impl World {
                 let fastest_mps2 = (limits.v_max_mps - car.v_mps) / dt_s;
                 // What it had is what the state frame says it did: a bad frame may have changed the command.
                 let held_mps2 = memories.get(&(zone, car.vehicle)).map_or(0.0, |_| car.u_mps2);
+                let wish_mps2 = match put_in {
+                    PutIn::Held(_) => held_mps2.min(fastest_mps2),
+                    PutIn::ToLimit => (limits.v_max_mps - car.v_mps) / DRIVE_ON_S,
+                };
                 VehicleCommand {
-                    u_mps2: held_mps2.min(fastest_mps2).clamp(limits.u_min_mps2, limits.u_max_mps2),
+                    u_mps2: wish_mps2.clamp(limits.u_min_mps2, limits.u_max_mps2),
                     vehicle: car.vehicle,
                     zone,
                     binding_rows: 0,
-                    verdict,
+                    verdict: put_in.verdict(),
                     ..memory
                 }
             })

@@ -18,7 +18,7 @@ mod traffic;
 mod way;
 
 pub use change::ChangeError;
-pub use gateway::CommandFault;
+pub use gateway::{CommandFault, PutIn};
 pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
 pub use overlap::{FirstOverlap, OverlapSummary};
 pub use role::{CoordinatorMasks, Sheet, World};

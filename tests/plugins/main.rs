@@ -5,6 +5,7 @@
 #[path = "../common/mod.rs"]
 mod common;
 
+mod exits;
 mod forged;
 mod hostile;
 mod sdks;

@@ -4,7 +4,7 @@
 const HEAD = 8, WORDS = 9, NONE = 0xffffffff, COMMANDED = 0x80;
 const MODES = ["entered", "FE", "OCBF"];
 const VERDICTS = ["as wished", "FE", "bound", "infeasible", "held", "held by shield"];
-const EVENTS = { infeasible: "--v-3", missed: "--m-other", replaced: "--accent", refused: "--v-5", skipped: "--quiet", steered: "--good" };
+const EVENTS = { infeasible: "--v-3", missed: "--m-other", exited: "--m-other", replaced: "--accent", refused: "--v-5", skipped: "--quiet", steered: "--good" };
 // Warm is slow, cool is fast: told apart with any kind of colour vision, and from what is behind.
 const RAMPS = {
   light: [[150, 30, 0], [224, 96, 10], [244, 180, 10], [48, 170, 160], [28, 116, 204], [24, 60, 150]],

@@ -41,6 +41,8 @@ pub enum EventKind {
     Skipped,
     /// Somebody steered the run.
     Steered,
+    /// A controller's process ended, and the run goes on.
+    Exited,
 }
 
 /// An event on the time line.
@@ -264,6 +266,7 @@ impl Index {
                 RunEventKind::Refused => EventKind::Refused,
                 RunEventKind::Replaced => EventKind::Replaced,
                 RunEventKind::Steered => EventKind::Steered,
+                RunEventKind::Exited => EventKind::Exited,
             };
             let is_known = |other: &Event| {
                 (other.step, other.kind) == (*step, kind)

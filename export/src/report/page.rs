@@ -386,6 +386,7 @@ fn events(page: &mut String, run: &Run) {
         (EventKind::Replaced, "Processes that were replaced"),
         (EventKind::Refused, "Senders whose frames were refused"),
         (EventKind::Steered, "Steering"),
+        (EventKind::Exited, "Controllers that ended"),
     ];
     for (kind, name) in kinds {
         let all: Vec<&Event> = run.events_of(kind).collect();
@@ -425,7 +426,7 @@ fn events(page: &mut String, run: &Run) {
         });
         let who = match kind {
             EventKind::Late | EventKind::Replaced => "#controller",
-            EventKind::Refused | EventKind::Steered => "",
+            EventKind::Refused | EventKind::Steered | EventKind::Exited => "",
             _ => "#vehicle",
         };
         table(page, &["#steps", "#from [s]", "#for [s]", "zone", who, "why"], rows.collect::<Vec<_>>());

@@ -19,6 +19,12 @@ pub(in crate::app) struct RunArgs {
     /// the scenario declares.
     #[arg(long = "controller", value_name = "TARGET=COMMAND")]
     pub controllers: Vec<String>,
+    /// What becomes of the vehicles of such a controller when its process ends in the middle of the run, e.g.
+    /// `--on-exit merge-2=restart`; may be repeated. CHOICE is end (the run ends with it, the default), restart (it is
+    /// started again), builtin (the built-in law drives from then on) or shield-fallback (they make for their speed
+    /// limits as far as the shield allows).
+    #[arg(long, value_name = "TARGET=CHOICE")]
+    pub on_exit: Vec<String>,
     /// The command line of a program that takes the world's place, to which `cz world`'s arguments are added; it brings
     /// in vehicles and moves them (see docs/world-contract.md).
     #[arg(long, value_name = "COMMAND", conflicts_with = "in_process")]

@@ -83,6 +83,8 @@ fn end_all(group: Pid, grace: Duration) {
     let own = std::process::id();
     let _ = kill_process_group(group, Signal::TERM);
     children_of(own).into_iter().for_each(|process| child::signal(process, Signal::TERM));
+    // Whoever is stopped is to hear it.
+    let _ = kill_process_group(group, Signal::CONT);
     let insist = move || {
         thread::sleep(grace);
         loop {

@@ -8,6 +8,7 @@ mod member;
 #[cfg(test)]
 mod tests;
 
+use crate::scenario::OnExit;
 pub(super) use member::{End, Kind};
 use member::{Member, Process};
 use std::time::Duration;
@@ -34,6 +35,8 @@ const SILENCE: Duration = Duration::from_secs(1);
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Act {
     Start(usize),
+    /// Start one of ours in its place from now on.
+    StandIn(usize),
     /// Have it end: SIGTERM.
     Ask(usize),
     /// End it: SIGKILL.
@@ -102,9 +105,15 @@ impl Life {
         self.members.len() - 1
     }
 
+    /// What becomes of the vehicles of a plug-in that ends in the middle of the run.
+    pub fn on_exit(&mut self, member: usize, choice: OnExit) {
+        self.members[member].on_exit = choice;
+    }
+
     /// It runs as this process.
     pub fn started(&mut self, member: usize, id: u32, now: Now) {
         let member = &mut self.members[member];
+        member.starts += 1;
         member.process = Process::Runs { id, since: now, asked: None, insisted: false };
         member.settled = false;
         member.last_words = None;
@@ -147,6 +156,24 @@ impl Life {
     /// What to call it.
     pub fn name(&self, member: usize) -> &str {
         &self.members[member].name
+    }
+
+    /// A plug-in that the run can do without has not answered for too long.
+    pub fn silent(&mut self, member: usize, now: Now, acts: &mut Vec<Act>) {
+        let it = &mut self.members[member];
+        if let (Phase::Running, Kind::Plugin, Process::Runs { id, asked: asked @ None, .. }) =
+            (&self.phase, it.kind, &mut it.process)
+        {
+            *asked = Some(now);
+            acts.push(Act::Say(format!("cz: {} (process {id}) does not answer and is ended", it.name)));
+            acts.push(Act::Ask(member));
+        }
+    }
+
+    /// A plug-in had this generation when all was over; one that was started more often than that was on its way.
+    pub fn came_to(&mut self, name: &str, generation: u32) {
+        let plugins = self.members.iter_mut().filter(|m| m.kind == Kind::Plugin && m.name == name);
+        plugins.for_each(|member| member.is_late = member.starts > generation + 1);
     }
 
     /// The world has said what the run has come to: nothing can spoil it any more.
@@ -197,20 +224,20 @@ impl Life {
         match &self.phase {
             Phase::Over { since: over } => {
                 let lingered = (now - *over).as_secs_f64();
-                match (asked, it.kind) {
+                match asked {
                     // Whoever came to replace somebody when all was over had not been let in.
-                    (Some(_), Kind::Part) if !it.settled => {}
-                    (Some(_), _) => {
+                    Some(_) if it.is_unknown() => {}
+                    Some(_) => {
                         let how = if insisted { "killed" } else { "ended" };
                         acts.push(Act::Say(format!(
                             "cz: {} (process {id}) was still there when the run was over; it was {how} after {lingered:.1} s",
                             it.name
                         )));
                     }
-                    (None, _) if *end != End::Code(0) => {
+                    None if *end != End::Code(0) => {
                         acts.push(Act::Say(format!("cz: {told}; the run was complete")));
                     }
-                    (None, _) => {}
+                    None => {}
                 }
             }
             Phase::Failed { .. } => {
@@ -227,6 +254,10 @@ impl Life {
             }
             Phase::Running if *end == End::Code(0) && it.kind != Kind::World => {
                 it.process = Process::Left { id, at: now };
+            }
+            // If the run has begun, the world will say so.
+            Phase::Running if it.on_exit == OnExit::ShieldFallback && self.stepped.is_none() => {
+                it.process = Process::Lost { at: now, end: end.clone(), told };
             }
             Phase::Running => {
                 if it.kind == Kind::World && *end == End::Code(0) {
@@ -276,12 +307,27 @@ impl Life {
         now: Now,
         acts: &mut Vec<Act>,
     ) {
+        let steps = self.stepped.is_some();
         let it = &mut self.members[member];
-        let deliberate = *end == End::Code(130);
+        let deliberate = *end == End::Code(130) && it.kind == Kind::Part;
+        let starts_again = match it.kind {
+            Kind::World => false,
+            Kind::Part => self.replaces,
+            Kind::Plugin => it.on_exit == OnExit::Restart,
+        };
         let in_a_row = if now.saturating_sub(since) >= PROBATION { 0 } else { it.restarts };
         if let Some(hangs) = hangs {
             self.fail(Failure::Failed(format!("{hangs}\n  {told}")), now);
-        } else if self.replaces && it.kind == Kind::Part && !deliberate && in_a_row < MAX_RESTARTS {
+        } else if it.kind == Kind::Plugin && it.on_exit == OnExit::Builtin {
+            // From here on it is one of ours.
+            acts.push(Act::Say(format!("cz: {told}; the built-in law drives its vehicles from now on")));
+            it.kind = Kind::Part;
+            it.name.push_str(" (built-in)");
+            it.process = Process::Starting;
+            acts.push(Act::StandIn(member));
+        } else if it.kind == Kind::Plugin && it.on_exit == OnExit::ShieldFallback && steps {
+            acts.push(Act::Say(format!("cz: {told}; the shield drives its vehicles from now on")));
+        } else if starts_again && !deliberate && in_a_row < MAX_RESTARTS {
             let pause = if in_a_row == 0 { Duration::ZERO } else { BACK_OFF * (1 << (in_a_row - 1)) };
             it.restarts = in_a_row + 1;
             it.process = Process::Due { at: now + pause };
@@ -309,6 +355,7 @@ impl Life {
     /// Does what is due.
     pub fn tick(&mut self, now: Now, acts: &mut Vec<Act>) {
         self.judge_those_who_left(now, acts);
+        self.judge_those_who_were_lost(now, acts);
         for i in 0..self.members.len() {
             let leave_by = self.leave_by(i);
             let member = &mut self.members[i];
@@ -329,6 +376,23 @@ impl Life {
                     acts.push(Act::Insist(i));
                 }
                 _ => {}
+            }
+        }
+    }
+
+    /// Whoever was lost when nobody knew yet whether the run had begun.
+    fn judge_those_who_were_lost(&mut self, now: Now, acts: &mut Vec<Act>) {
+        for i in 0..self.members.len() {
+            let Process::Lost { at, end, told } = &self.members[i].process else { continue };
+            if matches!(self.phase, Phase::Running) && self.stepped.is_none() && *at + GRACE > now {
+                continue;
+            }
+            let (at, end, told) = (*at, end.clone(), told.clone());
+            self.members[i].process = Process::Ended;
+            match self.phase {
+                Phase::Running => self.lose(i, &end, &told, None, at, now, acts),
+                Phase::Failed { .. } => self.add_words(&told),
+                Phase::Over { .. } => acts.push(Act::Say(format!("cz: {told}; the run was complete"))),
             }
         }
     }
@@ -368,8 +432,8 @@ impl Life {
             Phase::Running => None,
             Phase::Over { since } if self.interrupts > 0 => Some(*since),
             Phase::Over { since } => Some(match member.kind {
+                _ if member.is_unknown() => *since,
                 Kind::Plugin => *since + self.linger,
-                Kind::Part if !member.settled => *since,
                 Kind::World | Kind::Part => *since + GRACE,
             }),
             Phase::Failed { since, failure: Failure::Interrupted(_) } => Some(*since),
@@ -380,13 +444,13 @@ impl Life {
 
     /// When [`tick`](Life::tick) has something to do next.
     pub fn next_due(&self) -> Option<Now> {
-        let due = |(i, member): (usize, &Member)| match member.process {
-            Process::Due { at } => matches!(self.phase, Phase::Running).then_some(at),
+        let due = |(i, member): (usize, &Member)| match &member.process {
+            Process::Due { at } => matches!(self.phase, Phase::Running).then_some(*at),
             Process::Runs { asked: None, .. } => self.leave_by(i),
             Process::Runs { asked: Some(at), insisted: false, .. } => {
-                Some(if member.kind == Kind::Plugin { at + KEEPER_GRACE } else { at + GRACE })
+                Some(if member.kind == Kind::Plugin { *at + KEEPER_GRACE } else { *at + GRACE })
             }
-            Process::Left { at, .. } => Some(at + GRACE),
+            Process::Left { at, .. } | Process::Lost { at, .. } => Some(*at + GRACE),
             _ => None,
         };
         self.members.iter().enumerate().filter_map(due).min()

@@ -173,6 +173,9 @@ fn claim(run: &RunName) -> Result<(), AppError> {
     Ok(())
 }
 
+/// Arguments of `cz`, and environment, of the built-in controller that takes a plug-in's place.
+type StandIn = (Vec<OsString>, Vec<(&'static str, OsString)>);
+
 /// How to start a process of the run.
 #[derive(Clone, Debug)]
 struct Recipe {
@@ -182,6 +185,10 @@ struct Recipe {
     environment: Vec<(&'static str, OsString)>,
     /// What a shell is to become with the arguments, where that is not `cz`.
     shell: Option<String>,
+    /// Of a plug-in: arguments and environment of what may take its place.
+    stand_in: Option<StandIn>,
+    /// Of a plug-in: its index among the controllers.
+    controller: Option<u32>,
     /// The process that was started so last.
     process: Option<u32>,
     /// Where it is and what it was granted.
@@ -273,11 +280,20 @@ impl Children {
                 self.add(format!("{role} {index}"), Kind::Part, arguments, traced.clone());
             }
         }
-        for Plugin { name, command, .. } in plan.plugins {
+        for (plugin, Plugin { name, command, on_exit, .. }) in plan.plugins.iter().enumerate() {
             let Some(command) = command else { continue };
             let arguments = ["keep", "--supervised", &supervisor, "--", command].map(OsString::from).to_vec();
             let environment = vec![("CZ_RUN", run.clone().into()), ("CZ_CONTROLLER", name.into())];
             self.add(format!("controller {name}"), Kind::Plugin, arguments, environment);
+            let mut stand_in = vec!["ctrl".to_owned()];
+            stand_in.extend(common.clone());
+            stand_in.extend(plan.conduct.wait.to_flags());
+            stand_in.extend(["--index".to_owned(), (plan.pool as usize + plugin).to_string()]);
+            let (member, recipe) = (self.recipes.len() - 1, self.recipes.last_mut());
+            recipe.expect("it has just been added").stand_in =
+                Some((stand_in.into_iter().map(OsString::from).collect(), traced.clone()));
+            self.life.on_exit(member, *on_exit);
+            self.recipes[member].controller = Some(plan.pool + plugin as u32);
         }
     }
 
@@ -289,7 +305,17 @@ impl Children {
         environment: Vec<(&'static str, OsString)>,
     ) {
         self.life.add(name, kind);
-        self.recipes.push(Recipe { kind, arguments, environment, shell: None, process: None, settled: None });
+        let recipe = Recipe {
+            kind,
+            arguments,
+            environment,
+            shell: None,
+            stand_in: None,
+            controller: None,
+            process: None,
+            settled: None,
+        };
+        self.recipes.push(recipe);
     }
 
     /// Watches until the results are complete, or everybody has ended without any.
@@ -346,6 +372,14 @@ impl Children {
         for act in acts {
             match act {
                 Act::Start(member) => self.start(member),
+                Act::StandIn(member) => {
+                    let recipe = &mut self.recipes[member];
+                    let stand_in = recipe.stand_in.take();
+                    (recipe.arguments, recipe.environment) =
+                        stand_in.expect("a plug-in has one, and dies once");
+                    recipe.kind = Kind::Part;
+                    self.start(member);
+                }
                 Act::Ask(member) => self.signal(member, Signal::TERM),
                 Act::Insist(member) => self.signal(member, Signal::KILL),
                 Act::Say(line) => self.crier.cry(line),
@@ -410,7 +444,14 @@ impl Children {
                 self.life.stepped(now);
                 progress(position);
             }
+            Event::World(WorldLine::Silent(controller)) => {
+                let member = self.recipes.iter().position(|r| r.controller == Some(controller));
+                member.into_iter().for_each(|member| self.life.silent(member, now, &mut acts));
+            }
             Event::World(WorldLine::Outcome(outcome)) => {
+                for row in &outcome.controllers {
+                    self.life.came_to(&format!("controller {}", row.controller), row.generation);
+                }
                 self.outcome = Some(*outcome);
                 self.life.results_are_in(now, &mut acts);
             }

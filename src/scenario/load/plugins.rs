@@ -3,7 +3,7 @@
 use super::error::ScenarioError;
 use super::scope;
 use super::table::{Field, Table};
-use crate::scenario::{Plugin, Zone, ZoneId};
+use crate::scenario::{OnExit, Plugin, Zone, ZoneId};
 
 /// Controller processes have indices below 64, and the built-in pool wants at least one.
 const MAX_PLUGINS: usize = 63;
@@ -44,7 +44,12 @@ pub(super) fn read(root: &Table<'_>, zones: &[Zone]) -> Result<Vec<Plugin>, Scen
                 text => Some(text.to_owned()),
             },
         };
-        plugins.push(Plugin { name: name.to_owned(), paths, command });
+        const ON_EXIT: &str = "\"end\", \"restart\", \"builtin\" or \"shield-fallback\"";
+        let on_exit = match table.get("on_exit") {
+            None => OnExit::default(),
+            Some(field) => OnExit::of(field.str(ON_EXIT)?).ok_or_else(|| field.bad(ON_EXIT))?,
+        };
+        plugins.push(Plugin { name: name.to_owned(), paths, command, on_exit });
     }
     Ok(plugins)
 }

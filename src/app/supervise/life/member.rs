@@ -1,6 +1,7 @@
 //! A process of a run: what it is, how it ended, and in which words that is told.
 
 use super::Now;
+use crate::scenario::OnExit;
 
 /// What a process is in the run.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -42,6 +43,12 @@ pub(super) enum Process {
         id: u32,
         at: Now,
     },
+    /// It was lost, and who takes over depends on whether the run has begun, which the world will say.
+    Lost {
+        at: Now,
+        end: End,
+        told: String,
+    },
     Ended,
 }
 
@@ -50,7 +57,13 @@ pub(super) enum Process {
 pub(super) struct Member {
     pub name: String,
     pub kind: Kind,
+    /// Of a plug-in: what becomes of its vehicles without it.
+    pub on_exit: OnExit,
     pub process: Process,
+    /// How often it has been started.
+    pub starts: u32,
+    /// A plug-in that had been started again when all was over, and had not been let in.
+    pub is_late: bool,
     /// Restarts in a row.
     pub restarts: u32,
     /// Whether it has been let into the run.
@@ -62,8 +75,26 @@ pub(super) struct Member {
 impl Member {
     /// Somebody who is to be started at once.
     pub fn new(name: String, kind: Kind) -> Member {
-        let process = Process::Due { at: Now::ZERO };
-        Member { name, kind, process, restarts: 0, settled: false, last_words: None }
+        Member {
+            name,
+            kind,
+            on_exit: OnExit::End,
+            process: Process::Due { at: Now::ZERO },
+            starts: 0,
+            is_late: false,
+            restarts: 0,
+            settled: false,
+            last_words: None,
+        }
+    }
+
+    /// Whether nobody in the run has known it when all was over.
+    pub fn is_unknown(&self) -> bool {
+        match self.kind {
+            Kind::World => false,
+            Kind::Part => !self.settled,
+            Kind::Plugin => self.is_late,
+        }
     }
 
     /// How its process ended, and what it said last.

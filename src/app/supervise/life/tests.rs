@@ -229,3 +229,61 @@ fn nobody_is_started_again_for_a_world_that_is_stopped() {
     run.ends(2, End::Code(1), 120.0);
     assert!(run.failure().starts_with("the world (process 100) has made no step for 120 s"));
 }
+
+#[test]
+fn a_plug_in_that_dies_is_started_again_stood_in_for_or_left_as_chosen() {
+    let dies = |choice: OnExit, stepped: bool| {
+        let mut run = Scene::new();
+        run.life.on_exit(3, choice);
+        if stepped {
+            run.life.stepped(s(1.0));
+        }
+        run.ends(3, KILLED, 20.0);
+        run
+    };
+    let said = |text: &str| {
+        Act::Say(format!("cz: controller mine (process 103) was killed by signal 9 (SIGKILL); {text}"))
+    };
+    assert!(
+        dies(OnExit::End, true).failure().contains("controller mine (process 103) was killed by signal 9")
+    );
+
+    let mut restarted = dies(OnExit::Restart, true);
+    assert_eq!(restarted.at(20.0), [said("it is started again"), Act::Start(3)]);
+
+    let mut stood_in = dies(OnExit::Builtin, true);
+    let from_now_on = "the built-in law drives its vehicles from now on";
+    assert_eq!(stood_in.at(20.0), [said(from_now_on), Act::StandIn(3)]);
+    // From then on it is one of ours.
+    stood_in.life.started(3, 203, s(20.0));
+    stood_in.ends(3, KILLED, 30.0);
+    assert_eq!(stood_in.at(30.0)[1], Act::Start(3));
+
+    let mut left = dies(OnExit::ShieldFallback, true);
+    let from_now_on = "the shield drives its vehicles from now on";
+    assert_eq!((left.at(20.0), left.life.stage()), (vec![said(from_now_on)], Stage::Going));
+    // Before the run has begun there is nobody to drive; that it has may take a moment to be heard of.
+    let mut unknown = dies(OnExit::ShieldFallback, false);
+    assert_eq!((unknown.at(20.0), unknown.life.stage()), (vec![], Stage::Going));
+    unknown.at(23.0);
+    assert!(unknown.failure().contains("controller mine"));
+    let mut heard = dies(OnExit::ShieldFallback, false);
+    heard.life.stepped(s(20.5));
+    assert_eq!(heard.at(20.5), [said(from_now_on)]);
+}
+
+#[test]
+fn a_plug_in_on_its_way_when_all_was_over_is_ended_without_a_word() {
+    let mut run = Scene::new();
+    run.life.on_exit(3, OnExit::Restart);
+    run.life.stepped(s(1.0));
+    run.ends(3, KILLED, 20.0);
+    run.at(20.0);
+    run.life.started(3, 203, s(20.0));
+    // It had not been let in: its generation is that of the one before.
+    run.life.came_to("controller mine", 0);
+    run.finishes(21.0);
+    assert!(run.at(21.0).contains(&Act::Ask(3)));
+    run.ends(3, End::Signal(15, "SIGTERM"), 21.0);
+    assert_eq!(run.said(21.0), "");
+}
