@@ -24,8 +24,13 @@ const SIBLINGS: [(&str, &str); 5] = [
 /// Flags that documents say there is not.
 const NOT_THERE: [&str; 1] = ["--isolate"];
 /// Names of other people's code.
-const THEIRS: [&str; 4] =
-    ["F_SEAL_FUTURE_WRITE", "UnableToGenerateUniqueNodeId", "dev_permissions", "find_package"];
+const THEIRS: [&str; 5] = [
+    "ptrace_scope",
+    "F_SEAL_FUTURE_WRITE",
+    "UnableToGenerateUniqueNodeId",
+    "dev_permissions",
+    "find_package",
+];
 /// Keys of `--set` that are there as examples of the form only.
 const FORMS: [&str; 1] = ["KEY=VALUE"];
 

@@ -52,6 +52,7 @@ pub(super) fn run_as(
         resume: None,
         trace: None,
         world: None,
+        debugged: None,
     };
     let words = |e: AppError| e.to_string();
     let recording = match record {

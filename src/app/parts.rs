@@ -75,6 +75,7 @@ pub(super) fn world(args: &WorldArgs, traffic: Option<Box<dyn Traffic>>) -> Resu
         is_steered: args.conduct.steering.steered,
         begins_paused: args.conduct.steering.begin_paused,
         silent: if args.supervised.is_some() { tell_of_silence } else { |_| {} },
+        debugged: args.debugged.map_or(0, |index| 1_u64.checked_shl(index).unwrap_or(0)),
         run_id: Some(run_id),
     };
     let tell = report_to(args.supervised, &args.conduct.wait);

@@ -55,6 +55,7 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         resume: Some((&args.file, first)),
         trace: None,
         world: None,
+        debugged: None,
     };
     let lag = args.supervised.conduct.record_lag();
     let recording = match &args.record {

@@ -14,6 +14,7 @@ use crate::scenario::Scenario;
 use crate::transport::iox::RunName;
 use crate::world::{Traffic, World};
 use std::sync::Arc;
+use std::time::Duration;
 
 pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(), AppError> {
     if args.view {
@@ -41,6 +42,11 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
             "--in-process: nobody else can be late; --pace and --deadline are for several processes";
         return Err(AppError::Usage(problem.to_owned()));
     }
+    let debugged = debugged(args, &scenario)?;
+    let mut conduct_args = args.supervised.conduct;
+    if debugged.is_some() {
+        (conduct_args.wait.attach_timeout, conduct_args.wait.peer_timeout) = (WITHOUT_END, WITHOUT_END);
+    }
     let bar = Bar::new(&scenario);
     if args.in_process {
         return run_here(args, &arguments, &scenario, traffic, &bar);
@@ -52,11 +58,12 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
         plugins: &scenario.plugins,
         pool: scenario.controllers(args.share.ctrl_procs) - scenario.plugins.len() as u32,
         share: args.share,
-        conduct: args.supervised.conduct,
+        conduct: conduct_args,
         run_id: new_run_id(),
         resume: None,
         trace: args.trace.as_deref(),
         world: args.world.as_deref(),
+        debugged,
     };
     let recording = match &args.record {
         Some(path) => {
@@ -67,10 +74,30 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
         None => None,
     };
     let asked = args.supervised.conduct.wait.asks_for_placement();
-    conduct(&plan, recording, Some(&bar), |outcome| {
+    // Nothing is drawn over what a debugger says.
+    conduct(&plan, recording, debugged.is_none().then_some(&bar), |outcome| {
         let summary = Summary::new(&scenario, Transport::Iceoryx2 { processes }, outcome);
         summary.with_placement(asked).deliver(args.supervised.json.as_deref())
     })
+}
+
+/// No wait of a run that is debugged is longer than this.
+const WITHOUT_END: Duration = Duration::from_secs(86_400);
+
+/// Which of the plug-ins is debugged, if one is.
+fn debugged(args: &RunArgs, scenario: &Scenario) -> Result<Option<usize>, AppError> {
+    let Some(target) = &args.debug else { return Ok(None) };
+    let name = controllers::name_of(target);
+    let names: Vec<_> = scenario.plugins.iter().map(|plugin| plugin.name.as_str()).collect();
+    let at = names.iter().position(|known| *known == name).ok_or_else(|| {
+        let known = if names.is_empty() { "--controller with it".to_owned() } else { names.join(", ") };
+        AppError::Usage(format!("--debug {target}: expected a controller of the run: {known}"))
+    })?;
+    if args.supervised.json.as_deref() == Some(std::path::Path::new("-")) {
+        let problem = "--debug: the controller has the terminal; expected a file for --json";
+        return Err(AppError::Usage(problem.to_owned()));
+    }
+    Ok(Some(at))
 }
 
 /// A whole run in this process.

@@ -105,6 +105,8 @@ pub(super) struct Pacer {
     missed_by: Vec<(Role, u32, u64)>,
     /// Missed steps that began after their deadlines.
     backlog: u64,
+    /// Controllers, one bit each, while which are waited for no clock goes on.
+    unhurried: u64,
     lateness_ns: Histogram<u64>,
 }
 
@@ -129,8 +131,14 @@ impl Pacer {
             missed_steps: 0,
             missed_by: Vec::new(),
             backlog: 0,
+            unhurried: 0,
             lateness_ns: new_histogram(),
         }
+    }
+
+    /// Keeps no schedule while it is waited for these controllers, one bit each.
+    pub fn unhurried_by(self, controllers: u64) -> Pacer {
+        Pacer { unhurried: controllers, ..self }
     }
 
     /// What happens when a deadline is missed.
@@ -237,6 +245,13 @@ impl Pacer {
         if self.deadline.is_none_or(|deadline| Instant::now() < deadline) {
             return false;
         }
+        if awaited.role == Role::Controller && awaited.missing & self.unhurried != 0 {
+            // The schedule begins anew when the run goes on, and others have as long as ever once it does.
+            self.origin = None;
+            let allowed = self.timing.deadline.unwrap_or(self.step_length);
+            self.deadline = Some(Instant::now() + allowed);
+            return false;
+        }
         self.deadline = None;
         // One that began late has been counted when it began.
         self.missed_steps += u64::from(!self.began_late);
@@ -304,6 +319,26 @@ mod tests {
         let report = pacer.report(&ControllerNames::default()).expect("there was a schedule");
         let by = |i: usize| (report.missed_by[i].participant.as_str(), report.missed_by[i].steps);
         assert_eq!((report.missed_steps, by(0), by(1)), (2, ("controller 0", 1), ("controller 2", 2)));
+    }
+
+    #[test]
+    fn no_clock_goes_on_while_a_controller_is_debugged() {
+        let timing = Timing { pace: Pace::Realtime, deadline: None, on_miss: OnMiss::Hold };
+        let mut pacer = Pacer::new(timing, 1_000_000).unhurried_by(0b10);
+        let awaited = |missing| Awaited { role: Role::Controller, missing, what: "commands", step: 0 };
+        assert_eq!(pacer.until(0), None);
+        pacer.begin(0);
+        let start = Instant::now();
+        while start.elapsed() < Duration::from_millis(5) {
+            assert!(!pacer.has_missed(&awaited(0b11)));
+        }
+        // It has answered: from now on the other has a deadline, and the next step a schedule of its own.
+        while !pacer.has_missed(&awaited(0b01)) {
+            assert!(start.elapsed() < Duration::from_secs(60), "no deadline in a minute");
+        }
+        assert!(pacer.due(1) >= start + Duration::from_millis(5));
+        let report = pacer.report(&ControllerNames::default()).expect("there was a schedule");
+        assert_eq!((report.missed_steps, report.began_late), (1, 0));
     }
 
     /// It used to have none: nobody was fallen back on while the world was behind, which is when it matters.

@@ -55,6 +55,8 @@ pub struct WorldOptions {
     /// Told of a controller (its index) that has not answered for half of `peer_timeout` and that the run can do
     /// without; it is to end it.
     pub silent: fn(u32),
+    /// Controllers that are debugged, one bit each: no clock goes on while they are waited for.
+    pub debugged: u64,
     /// The run's id, where it has been chosen already.
     pub run_id: Option<u64>,
 }
@@ -233,7 +235,7 @@ pub fn run_world(
         reception,
         members,
         replace: options.replace,
-        pacer: Pacer::new(options.timing, scenario.dt_ns),
+        pacer: Pacer::new(options.timing, scenario.dt_ns).unhurried_by(options.debugged),
         viewing,
         events: Events::default(),
         overdue: None,

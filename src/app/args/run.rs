@@ -25,6 +25,10 @@ pub(in crate::app) struct RunArgs {
     /// limits as far as the shield allows).
     #[arg(long, value_name = "TARGET=CHOICE")]
     pub on_exit: Vec<String>,
+    /// Debug such a controller, e.g. `--debug merge-2`: it has the terminal, and no clock or timeout goes on while it is
+    /// waited for.
+    #[arg(long, value_name = "TARGET", conflicts_with_all = ["in_process", "view"])]
+    pub debug: Option<String>,
     /// The command line of a program that takes the world's place, to which `cz world`'s arguments are added; it brings
     /// in vehicles and moves them (see docs/world-contract.md).
     #[arg(long, value_name = "COMMAND", conflicts_with = "in_process")]
@@ -79,6 +83,9 @@ pub(in crate::app) struct WorldArgs {
     /// Begin only once somebody looks on.
     #[arg(long, hide = true)]
     pub observed: bool,
+    /// Index of a controller that is debugged: no clock goes on while it is waited for.
+    #[arg(long, hide = true, value_name = "I")]
+    pub debugged: Option<u32>,
     /// The run's id.
     #[arg(long, hide = true, value_name = "ID")]
     pub run_id: Option<u64>,
@@ -115,6 +122,9 @@ pub(in crate::app) struct KeepArgs {
     /// Process id of the supervisor.
     #[arg(long, value_name = "PID")]
     pub supervised: u32,
+    /// Leave it the terminal.
+    #[arg(long)]
+    pub terminal: bool,
     /// The command, for `sh -c`.
     #[arg(last = true, value_name = "COMMAND")]
     pub command: String,

@@ -41,6 +41,8 @@ pub(super) enum Stdout {
     Report,
     /// Lines for people.
     Lines,
+    /// Whoever sits at the terminal, which the process reads too.
+    Terminal,
 }
 
 /// Starts a process whose words and end come as events; returns its id.
@@ -50,8 +52,12 @@ pub(super) fn start(
     stdout: Stdout,
     events: &Sender<Event>,
 ) -> Result<u32, Error> {
-    let out = if stdout == Stdout::Nobody { Stdio::null() } else { Stdio::piped() };
-    let mut child = command.stdin(Stdio::null()).stdout(out).stderr(Stdio::piped()).spawn()?;
+    let (input, out) = match stdout {
+        Stdout::Nobody => (Stdio::null(), Stdio::null()),
+        Stdout::Terminal => (Stdio::inherit(), Stdio::inherit()),
+        Stdout::Report | Stdout::Lines => (Stdio::null(), Stdio::piped()),
+    };
+    let mut child = command.stdin(input).stdout(out).stderr(Stdio::piped()).spawn()?;
     let process = child.id();
     listen(&mut child, member, stdout, events).inspect_err(|_| {
         signal(process, Signal::KILL);

@@ -15,8 +15,10 @@ use rustix::process::{
     Pid, Resource, Rlimit, Signal, WaitOptions, WaitStatus, getpid, kill_process_group, set_child_subreaper,
     setrlimit, wait,
 };
+use rustix::termios::tcsetpgrp;
 use signal_hook::consts::{SIGCHLD, SIGHUP, SIGINT, SIGKILL, SIGTERM};
 use signal_hook::iterator::Signals;
+use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::process::{Command, Stdio};
 use std::thread;
@@ -35,14 +37,22 @@ pub(in crate::app) fn keep(args: &KeepArgs) -> Result<(), AppError> {
     // Whoever loses its parent comes to us, so that nobody gets away by leaving its group.
     set_child_subreaper(Some(getpid())).map_err(|e| failed("cannot keep what the command starts", &e))?;
     follow_supervisor(Some(args.supervised))?;
-    let child = Command::new("sh")
-        .args(["-c", &args.command])
-        .stdin(Stdio::null())
-        .process_group(0)
-        .spawn()
-        .map_err(|e| failed("cannot start sh", &e))?;
-    say(PartLine::Keeps(child.id()).to_line());
+    let mut command = Command::new("sh");
+    command.args(["-c", &args.command]).process_group(0);
+    if args.terminal {
+        // What it says does not go through the supervisor, which would keep a prompt until the line ends.
+        let terminal = std::io::stdout().as_fd().try_clone_to_owned();
+        command.stderr(terminal.map_err(|e| failed("cannot leave it the terminal", &e))?);
+    } else {
+        command.stdin(Stdio::null());
+    }
+    let child = command.spawn().map_err(|e| failed("cannot start sh", &e))?;
     let group = Pid::from_raw(child.id() as i32).expect("a process has an id");
+    if args.terminal {
+        // It may read there now, and is interrupted from there alone. Without a terminal there is nothing to be given.
+        let _ = tcsetpgrp(std::io::stdin(), group);
+    }
+    say(PartLine::Keeps(child.id()).to_line());
     let mut status = None;
     let mut is_ending = false;
     loop {

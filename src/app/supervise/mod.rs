@@ -50,6 +50,8 @@ pub(super) struct Plan<'a> {
     pub trace: Option<&'a Path>,
     /// Who takes the world's place, for `sh -c`.
     pub world: Option<&'a str>,
+    /// The plug-in that is debugged.
+    pub debugged: Option<usize>,
 }
 
 /// Events that may wait to be dealt with: whoever floods us waits.
@@ -189,6 +191,8 @@ struct Recipe {
     stand_in: Option<StandIn>,
     /// Of a plug-in: its index among the controllers.
     controller: Option<u32>,
+    /// Whether it is debugged, and so has the terminal.
+    has_terminal: bool,
     /// The process that was started so last.
     process: Option<u32>,
     /// Where it is and what it was granted.
@@ -255,6 +259,7 @@ impl Children {
         world.extend(plan.conduct.to_flags());
         world.extend(["--run-id".to_owned(), plan.run_id.to_string()]);
         world.extend(observed.then(|| "--observed".to_owned()));
+        world.extend(plan.debugged.map(|plugin| format!("--debugged={}", plan.pool as usize + plugin)));
         world.extend(plan.scenario.to_arguments());
         world.extend(plan.resume.map(|(_, steps)| format!("--resume-steps={steps}")));
         let mut world: Vec<_> = world.into_iter().map(OsString::from).collect();
@@ -282,7 +287,10 @@ impl Children {
         }
         for (plugin, Plugin { name, command, on_exit, .. }) in plan.plugins.iter().enumerate() {
             let Some(command) = command else { continue };
-            let arguments = ["keep", "--supervised", &supervisor, "--", command].map(OsString::from).to_vec();
+            let has_terminal = plan.debugged == Some(plugin);
+            let terminal = has_terminal.then_some("--terminal");
+            let arguments = ["keep", "--supervised", &supervisor].into_iter().chain(terminal);
+            let arguments = arguments.chain(["--", command]).map(OsString::from).collect();
             let environment = vec![("CZ_RUN", run.clone().into()), ("CZ_CONTROLLER", name.into())];
             self.add(format!("controller {name}"), Kind::Plugin, arguments, environment);
             let mut stand_in = vec!["ctrl".to_owned()];
@@ -293,6 +301,7 @@ impl Children {
             recipe.expect("it has just been added").stand_in =
                 Some((stand_in.into_iter().map(OsString::from).collect(), traced.clone()));
             self.life.on_exit(member, *on_exit);
+            self.recipes[member].has_terminal = has_terminal;
             self.recipes[member].controller = Some(plan.pool + plugin as u32);
         }
     }
@@ -312,6 +321,7 @@ impl Children {
             shell: None,
             stand_in: None,
             controller: None,
+            has_terminal: false,
             process: None,
             settled: None,
         };
@@ -403,6 +413,7 @@ impl Children {
         let stdout = match recipe.kind {
             Kind::World => Stdout::Report,
             Kind::Part => Stdout::Nobody,
+            Kind::Plugin if recipe.has_terminal => Stdout::Terminal,
             Kind::Plugin => Stdout::Lines,
         };
         let now = self.time.look(2 * LOOK);
@@ -472,7 +483,16 @@ impl Children {
     /// Takes a line of somebody's stderr.
     fn take_words(&mut self, member: usize, line: String) {
         match (self.recipes[member].kind, PartLine::of(&line)) {
-            (Kind::Plugin, Some(PartLine::Keeps(plugin))) => return self.life.is_process(member, plugin),
+            (Kind::Plugin, Some(PartLine::Keeps(plugin))) => {
+                if self.recipes[member].has_terminal {
+                    let name = self.life.name(member);
+                    self.crier.cry(format!(
+                        "cz: {name} (process {plugin}) has the terminal, and the run waits for it; from another one: \
+                         gdb -p {plugin}, lldb -p {plugin}, or for Python py-spy dump --pid {plugin}"
+                    ));
+                }
+                return self.life.is_process(member, plugin);
+            }
             (Kind::Plugin, _) => self.crier.cry(format!("[{}] {line}", self.life.name(member))),
             (_, Some(PartLine::Settled(settled))) => {
                 self.life.settled(member);
