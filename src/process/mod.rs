@@ -9,7 +9,9 @@ mod participant;
 mod peers;
 mod placement;
 pub mod plugin_check;
+mod plugin_child;
 mod plugin_log;
+mod plugin_replay;
 mod realtime;
 mod restore;
 mod run_spec;
@@ -29,6 +31,9 @@ pub use participant::{Conduct, run_controller, run_coordinator};
 pub use peers::{Peer, Peers, children_of, is_orphaned, is_stopped};
 pub use placement::{Affinity, Placement, place, unplaced};
 pub use plugin_log::{DrivenBy, PluginRow};
+pub use plugin_replay::{
+    CommandDifference, PluginReplay, PluginReplayError, PluginReplayOptions, replay_plugin,
+};
 pub use realtime::{Held, Settled, Settling};
 pub use restore::{RestoreError, restore};
 pub use run_spec::plugin_bytes;

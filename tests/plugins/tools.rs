@@ -1,8 +1,75 @@
-//! What authors of controllers work with: what a controller is shown beside states.
+//! What authors of controllers work with: `cz plugin replay`, what a controller is shown beside states.
 
 use crate::common::TestRun;
-use crate::python;
+use crate::{cz, python, rust};
+use serde_json::Value;
 use std::path::Path;
+use std::process::Output;
+
+/// Records a minute of a run in which a command drives merge-2.
+fn recorded(command: &str, file: &Path) {
+    let test_run = TestRun::new("tools");
+    let controller = format!("merge-2={command}");
+    let more = ["--set", "end.time_s=60", "--shield", "on", "--record", file.to_str().unwrap()];
+    test_run
+        .start("cz", &[&["--controller", controller.as_str()], &more[..]].concat())
+        .ended()
+        .expect(0, &[]);
+    test_run.assert_clean();
+}
+
+fn replayed(file: &Path, arguments: &[&str], command: &[&str]) -> (Output, Value) {
+    let mut replay = cz();
+    let output =
+        replay.args(["plugin", "replay", "--json"]).args(arguments).arg(file).arg("--").args(command);
+    let output = output.output().unwrap();
+    let report = serde_json::from_slice(&output.stdout).unwrap_or(Value::Null);
+    (output, report)
+}
+
+#[test]
+fn a_controller_replayed_offline_commands_what_was_recorded_and_another_is_shown_to_differ() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("run.czlog");
+    let cruise = rust("cruise");
+    recorded(&cruise, &file);
+    let (output, report) = replayed(&file, &[], &[&cruise]);
+    assert!(output.status.success(), "{output:?}");
+    let count = |report: &Value, key: &str| report[key].as_u64().unwrap_or_else(|| panic!("{key}: {report}"));
+    assert_eq!((count(&report, "steps"), count(&report, "differing")), (600, 0), "{report}");
+    assert!(count(&report, "commands") > 1000, "{report}");
+    // From the middle on it is handed what was in force.
+    let (output, late) = replayed(&file, &["--from", "300"], &[&cruise]);
+    assert!(output.status.success() && count(&late, "steps") == 300, "{output:?}");
+    // Another: the first difference is named with step, vehicle and both values.
+    let (output, other) = replayed(&file, &[], &[&rust("broken"), "out-of-range"]);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let (first, greatest) = (&other["differences"][0], &other["greatest"]);
+    assert!(first["u_mps2"] != first["recorded_mps2"] && count(first, "step") > 0, "{other}");
+    assert!(first["zone"].as_str().unwrap().starts_with("merge-2."), "{other}");
+    let apart = |d: &Value| (d["u_mps2"].as_f64().unwrap() - d["recorded_mps2"].as_f64().unwrap()).abs();
+    assert!(other["differences"].as_array().unwrap().iter().all(|d| apart(d) <= apart(greatest)), "{other}");
+    let told =
+        cz().args(["plugin", "replay"]).arg(&file).args(["--", &rust("broken"), "out-of-range"]).output();
+    let told = String::from_utf8(told.unwrap().stdout).unwrap();
+    assert!(told.contains(" m/s², recorded ") && told.contains("greatest: step "), "{told}");
+    // In the place of the built-in law.
+    let (output, law) = replayed(&file, &["--controller", "merge-1"], &[&cruise]);
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    assert!(count(&law, "steps") == 600 && count(&law, "differing") > 100, "{law}");
+    for (arguments, words) in [
+        (&["--controller", "merge-3"][..], "expected a controller, zones or paths of the recording: merge-2"),
+        (&["--from", "9999"], "step 9999 is not in the recording"),
+        (&["--tolerance=-1"], "--tolerance -1"),
+    ] {
+        let (output, _) = replayed(&file, arguments, &[&cruise]);
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(2) && said.contains(words), "{arguments:?}: {said}");
+    }
+    let (output, _) = replayed(&file, &[], &["false"]);
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains("the controller ended"), "{said}");
+}
 
 /// Runs a law in Python for a minute as the controller of merge-2; what it and the run said.
 fn driven(python: &str, law: &Path, arguments: &[&str]) -> crate::common::Ended {

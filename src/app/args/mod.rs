@@ -118,8 +118,39 @@ pub(super) enum PluginCommand {
         #[arg(last = true, required = true, value_name = "COMMAND")]
         command: Vec<String>,
     },
+    /// Drive a controller by a recording instead of a run, and show where its commands differ from those recorded.
+    Replay(PluginReplayArgs),
     /// Print test vectors of the paper's law as JSON: trajectories, rows and commands.
     Golden,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct PluginReplayArgs {
+    /// The recording (.czlog).
+    #[arg(value_name = "FILE")]
+    pub file: PathBuf,
+    /// What it drives: the name of a controller of the recorded run, or a list such as `merge-1,merge-2.main`, whoever
+    /// drove it then [default: the recorded run's controller, where it had one].
+    #[arg(long, value_name = "TARGET")]
+    pub controller: Option<String>,
+    /// First step it is shown.
+    #[arg(long, value_name = "STEP", default_value_t = 0)]
+    pub from: u64,
+    /// Accelerations that differ by no more than this are the same, m/s^2.
+    #[arg(long, value_name = "MPS2", default_value_t = 0.0)]
+    pub tolerance: f64,
+    /// How long it may take to join and to answer each step, s.
+    #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
+    pub patience: f64,
+    /// Leave it the terminal, and wait for it without end: for breakpoints.
+    #[arg(long)]
+    pub debug: bool,
+    /// Print JSON.
+    #[arg(long, conflicts_with = "debug")]
+    pub json: bool,
+    /// The controller's command line, after `--`.
+    #[arg(last = true, required = true, value_name = "COMMAND")]
+    pub command: Vec<String>,
 }
 
 #[derive(Debug, Subcommand)]

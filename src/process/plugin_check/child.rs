@@ -2,42 +2,27 @@
 
 use super::{CONTROLLER, INDEX, JOIN, Kit, Rule};
 use crate::process::ProcessError;
+use crate::process::plugin_child::PluginChild;
 use ipc_schemas::{Member, ROLE_COORDINATOR};
-use rustix::process::{Pid, Signal, kill_process_group};
-use std::os::unix::process::CommandExt;
-use std::process::{Command, Stdio};
+use rustix::process::Signal;
 use std::time::{Duration, Instant};
 
 impl Kit<'_> {
-    pub(super) fn start(&mut self) -> Result<(), ProcessError> {
-        let child = Command::new(&self.command[0])
-            .args(&self.command[1..])
-            .env("CZ_RUN", self.run.to_string())
-            .env("CZ_CONTROLLER", CONTROLLER)
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .process_group(0)
-            .spawn();
-        match child {
+    pub(super) fn start(&mut self) {
+        match PluginChild::start(self.command, self.run, CONTROLLER, false) {
             Ok(child) => self.child = Some(child),
             Err(error) => self.breach(Rule::Attach, format!("cannot be started: {error}")),
         }
-        Ok(())
     }
 
     /// Ends the controller, and whatever it started.
     pub(super) fn stop(&mut self) {
-        if let Some(mut child) = self.child.take() {
-            if let Some(group) = Pid::from_raw(child.id() as i32) {
-                let _ = kill_process_group(group, Signal::KILL);
-            }
-            let _ = child.wait();
-        }
+        self.child = None;
     }
 
     /// How the controller has ended, if it has.
     pub(super) fn ended(&mut self) -> Option<String> {
-        let status = self.child.as_mut()?.try_wait().ok()??;
+        let status = self.child.as_mut()?.ended()?;
         Some(format!("it ended: {status}"))
     }
 
@@ -66,10 +51,6 @@ impl Kit<'_> {
 
     /// Stops the controller, and whatever it started, or lets them go on.
     pub(super) fn signal(&self, signal: Signal) {
-        let id = self.child.as_ref().and_then(|child| Pid::from_raw(child.id() as i32));
-        if let Some(group) = id {
-            // If it has ended, that is noticed soon enough.
-            let _ = kill_process_group(group, signal);
-        }
+        self.child.iter().for_each(|child| child.signal(signal));
     }
 }

@@ -12,6 +12,7 @@ mod rules;
 pub use rules::{Breach, Report, Rule};
 
 use super::attach::{Readiness, Reception};
+use super::plugin_child::PluginChild;
 use super::services::MembersOutbox;
 use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
@@ -26,7 +27,6 @@ use ipc_schemas::{
     self as frames, Assignment, FLAG_END_OF_RUN, FrameHeader, Role, VehicleCommand, VehicleState,
 };
 use rustix::process::Signal;
-use std::process::Child;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -133,7 +133,7 @@ struct Kit<'a> {
     answered: u64,
     command: &'a [String],
     run: &'a RunName,
-    child: Option<Child>,
+    child: Option<PluginChild>,
 }
 
 impl Kit<'_> {
@@ -170,7 +170,7 @@ impl Kit<'_> {
     }
 
     fn drive(&mut self) -> Result<(), ProcessError> {
-        self.start()?;
+        self.start();
         if self.child.is_none() || !self.admit(Rule::Attach)? {
             return Ok(());
         }
@@ -184,7 +184,7 @@ impl Kit<'_> {
                 while self.commands.receive()?.is_some() {}
                 self.reception.vacate(INDEX as usize);
                 self.reception.go_on_from(step);
-                self.start()?;
+                self.start();
                 if !self.admit(Rule::Restart)? {
                     return Ok(());
                 }
@@ -300,7 +300,7 @@ impl Kit<'_> {
         self.state.loan(header, 0, |_| {})?.send()?;
         let deadline = Instant::now() + JOIN;
         loop {
-            let status = self.child.as_mut().and_then(|c| c.try_wait().ok().flatten());
+            let status = self.child.as_mut().and_then(PluginChild::ended);
             match status {
                 Some(status) if status.success() => return Ok(()),
                 Some(status) => {
