@@ -11,6 +11,7 @@ mod draw;
 mod golden;
 mod lines;
 mod measured;
+mod new;
 mod parts;
 mod plan;
 mod plugin;

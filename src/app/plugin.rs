@@ -12,6 +12,7 @@ use std::time::Duration;
 pub(super) fn plugin(command: &PluginCommand) -> Result<(), AppError> {
     match command {
         PluginCommand::Check { deadline_ms, json, command } => run(*deadline_ms, *json, command),
+        PluginCommand::New(args) => super::new::new(args),
         PluginCommand::Replay(args) => replay(args),
         PluginCommand::Golden => print(&super::golden::text()),
     }

@@ -1,10 +1,10 @@
-//! What authors of controllers work with: `cz plugin replay`, what a controller is shown beside states.
+//! What authors of controllers work with: `cz plugin replay`, `cz plugin new`, what a controller is shown beside states.
 
 use crate::common::TestRun;
-use crate::{cz, python, rust};
+use crate::{beside, cz, installed, python, root, rust};
 use serde_json::Value;
 use std::path::Path;
-use std::process::Output;
+use std::process::{Command, Output};
 
 /// Records a minute of a run in which a command drives merge-2.
 fn recorded(command: &str, file: &Path) {
@@ -69,6 +69,71 @@ fn a_controller_replayed_offline_commands_what_was_recorded_and_another_is_shown
     let (output, _) = replayed(&file, &[], &["false"]);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.code() == Some(1) && said.contains("the controller ended"), "{said}");
+}
+
+/// What a command says; it must succeed.
+fn said(command: &mut Command) -> String {
+    let output = command.output().unwrap_or_else(|error| panic!("{command:?}: {error}"));
+    let (out, err) = (String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+    assert!(output.status.success(), "{command:?}: {out}{err}");
+    format!("{out}{err}")
+}
+
+/// A new project, in which `check` says what to run.
+fn made(language: &str, folder: &Path, more: &[&str]) -> std::path::PathBuf {
+    let directory = folder.join(format!("mine-{language}"));
+    let mut new = Command::new(env!("CARGO_BIN_EXE_cz"));
+    let told = said(new.args(["plugin", "new", language]).args(more).arg(&directory));
+    assert!(told.contains("README.md") && told.contains("cz plugin check -- "), "{told}");
+    // What is there is not written over.
+    let again = cz().args(["plugin", "new", language]).arg(&directory).assert().code(2).get_output().clone();
+    assert!(String::from_utf8_lossy(&again.stderr).contains("is there and not empty"), "{again:?}");
+    directory
+}
+
+fn keeps_the_contract(directory: &Path, command: &[&str]) {
+    let mut check = Command::new(env!("CARGO_BIN_EXE_cz"));
+    check.current_dir(directory).args(["plugin", "check", "--deadline-ms", "4000", "--"]).args(command);
+    let told = said(&mut check);
+    assert!(!told.contains("FAIL") && told.contains("steps answered"), "{told}");
+}
+
+#[test]
+fn a_new_project_builds_and_keeps_the_contract() {
+    installed(); // builds the library
+    let folder = tempfile::tempdir().unwrap();
+    for language in ["c", "cpp"] {
+        let directory = made(language, folder.path(), &[]);
+        let flags = if language == "c" { "CFLAGS" } else { "CXXFLAGS" };
+        let mut make = Command::new("make");
+        make.current_dir(&directory).arg(format!("CZ={}", env!("CARGO_BIN_EXE_cz")));
+        said(make.arg(format!("{flags}=-Wall -Wextra -Werror")));
+        keeps_the_contract(&directory, &["./controller"]);
+    }
+    if let Some(python) = python() {
+        let directory = made("python", folder.path(), &[]);
+        keeps_the_contract(&directory, &[&python, "controller.py"]);
+    }
+    cz().args(["plugin", "new", "python", "/tmp/1st"]).assert().code(2);
+    cz().args(["plugin", "new", "rust", "--sdk", "/nowhere"]).arg(folder.path().join("x")).assert().code(2);
+}
+
+/// `cargo test --test plugins -- --ignored new_project_in_rust`: it is built against the package of this clone.
+#[test]
+#[ignore = "builds the package anew"]
+fn a_new_project_in_rust_builds_and_keeps_the_contract() {
+    let folder = tempfile::tempdir().unwrap();
+    let directory = made("rust", folder.path(), &["--sdk", root().to_str().unwrap()]);
+    // The same versions as here, without a registry.
+    std::fs::copy(root().join("Cargo.lock"), directory.join("Cargo.lock")).unwrap();
+    let mut build = Command::new(env!("CARGO"));
+    build
+        .current_dir(&directory)
+        .args(["build", "--offline"])
+        .env("CARGO_TARGET_DIR", beside().parent().unwrap());
+    said(&mut build);
+    let program = beside().join("mine-rust");
+    keeps_the_contract(&directory, &[program.to_str().unwrap()]);
 }
 
 /// Runs a law in Python for a minute as the controller of merge-2; what it and the run said.

@@ -118,10 +118,35 @@ pub(super) enum PluginCommand {
         #[arg(last = true, required = true, value_name = "COMMAND")]
         command: Vec<String>,
     },
+    /// Make the project of a new controller, which builds and keeps the contract.
+    New(PluginNewArgs),
     /// Drive a controller by a recording instead of a run, and show where its commands differ from those recorded.
     Replay(PluginReplayArgs),
     /// Print test vectors of the paper's law as JSON: trajectories, rows and commands.
     Golden,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct PluginNewArgs {
+    /// What it is written in.
+    #[arg(value_enum, value_name = "LANGUAGE")]
+    pub language: Language,
+    /// Directory to make.
+    #[arg(value_name = "DIR")]
+    pub directory: PathBuf,
+    /// For Rust: a clone of Control Zones to build against [default: the one this program was built in, or the published
+    /// package].
+    #[arg(long, value_name = "DIR")]
+    pub sdk: Option<PathBuf>,
+}
+
+/// What a controller is written in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum Language {
+    Python,
+    C,
+    Cpp,
+    Rust,
 }
 
 #[derive(Debug, Args)]
