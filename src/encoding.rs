@@ -10,11 +10,12 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use thiserror::Error;
 
-/// No more bytes than this are decoded, nor allocated on the word of a length field.
-pub const MAX_BYTES: usize = 64 << 20;
+/// No more bytes than this are decoded, nor allocated on the word of a length field. A network of grids that holds a
+/// hundred thousand vehicles takes 114 million.
+pub const MAX_BYTES: usize = 192 << 20;
 
 /// No more bytes than this are read of a kept value: what processes can be handed, with names around it.
-pub const MAX_KEPT_BYTES: usize = 160 << 20;
+pub const MAX_KEPT_BYTES: usize = 480 << 20;
 
 /// Why bytes are not an encoded value.
 #[derive(Debug, Error)]

@@ -51,14 +51,30 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
     }
     // Counted once and remembered: afterwards this process has but one.
     number_of_cores();
-    let cores = cores();
-    let core = match (role, &cores[..]) {
-        (_, []) => return None,
-        (Role::World, [first, ..]) | (_, [first]) => *first,
+    move_to(core_of(role, index)?)
+}
+
+/// Puts the calling thread where [`place`] would pin it, and leaves it free to go: the system would find a good
+/// place for it too, after as long as a short run takes.
+pub(super) fn begin_apart(role: Role, index: u32) {
+    let Some(free) = Affinity::current() else { return };
+    if core_of(role, index).and_then(move_to).is_some() {
+        free.restore();
+    }
+}
+
+/// The core of such a process.
+fn core_of(role: Role, index: u32) -> Option<usize> {
+    match (role, &cores()[..]) {
+        (_, []) => None,
+        (Role::World, [first, ..]) | (_, [first]) => Some(*first),
         // Controllers in excess share the world's core too: it has nothing to do while they work.
-        (Role::Controller, all) => all[(index as usize + 1) % all.len()],
-        (_, [_, others @ ..]) => others[index as usize % others.len()],
-    };
+        (Role::Controller, all) => Some(all[(index as usize + 1) % all.len()]),
+        (_, [_, others @ ..]) => Some(others[index as usize % others.len()]),
+    }
+}
+
+fn move_to(core: usize) -> Option<usize> {
     let mut set = CpuSet::new();
     set.set(core);
     sched_setaffinity(None, &set).ok()?;

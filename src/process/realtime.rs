@@ -5,7 +5,7 @@
 //! yield otherwise, and now and then in any case ([`Breather`]); and a limit on the time between two sleeps
 //! ends it should it never sleep again.
 
-use super::placement::{cores, number_of_cores};
+use super::placement::{begin_apart, cores, number_of_cores};
 use super::{Placement, WaitMode, place};
 use ipc_schemas::Role;
 use rustix::mm::{MlockAllFlags, mlockall};
@@ -65,7 +65,9 @@ impl Settling<'_> {
     /// Settles the calling process, in a run of that many processes that wait busily (world and
     /// controllers; all of them when everybody spins). Never fails: what is refused is reported.
     pub fn settle(&self, role: Role, index: u32, wait: WaitMode, hot_processes: usize) -> Held {
-        place(self.pin, role, index);
+        if place(self.pin, role, index).is_none() {
+            begin_apart(role, index);
+        }
         let process = if role == Role::World { role.to_string() } else { format!("{role} {index}") };
         let (mut memory_locked, mut memory_note) = (false, None);
         if self.realtime {

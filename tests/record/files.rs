@@ -2,8 +2,8 @@
 
 use super::common::{self, LONG_RUN, TestRun, begin, is_alive, part, wait_until};
 use super::*;
+use control_zones::encoding::MAX_KEPT_BYTES;
 use control_zones::record::{RecordError, Recorder};
-use control_zones::scenario::{Arrival, Demand};
 use rustix::process::Signal;
 use std::path::{Path, PathBuf};
 use std::process::Output;
@@ -178,9 +178,7 @@ fn a_file_for_the_summary_that_cannot_be_written_costs_no_results() {
 fn a_scenario_too_large_to_be_read_again_is_not_recorded() {
     let (_directory, file, _) = place();
     let mut large = Scenario::clone(&scenario("two-merges", &[]));
-    let arrivals =
-        (0..5_000_000).map(|i| Arrival { time_s: f64::from(i) * 0.1, speed_mps: 15.1, route: None });
-    large.network.roads[0].demand = Demand::Trace(arrivals.collect());
+    large.name = "x".repeat(MAX_KEPT_BYTES);
     let error = Recorder::create(&file, &metadata(&large, 1, 1)).err();
     assert!(matches!(error, Some(RecordError::TooLarge { .. })), "{error:?}");
 }
