@@ -1,17 +1,14 @@
 //! `cz run --controller TARGET=COMMAND`: a controller of one's own, without editing a scenario.
 
 use super::AppError;
-use super::args::ScenarioArgs;
-use crate::scenario::{OnExit, Scenario, declaration, target_and_command};
+use super::args::{RunArgs, ScenarioArgs};
+use super::supervise::Programs;
+use crate::scenario::{OnExit, Plugin, Scenario, declaration, target_and_command};
 
-/// The scenario arguments with `--controller`s and `--on-exit`s turned into `--set`s, and the scenario they give.
-pub(super) fn load(
-    scenario: &ScenarioArgs,
-    controllers: &[String],
-    on_exit: &[String],
-) -> Result<(ScenarioArgs, Scenario), AppError> {
-    let (mut arguments, mut loaded) = declare(scenario, controllers)?;
-    for text in on_exit {
+/// The scenario arguments with `--controller`, `--on-exit` and `--reload` turned into `--set`s, and the scenario they give.
+pub(super) fn load(scenario: &ScenarioArgs, run: &RunArgs) -> Result<(ScenarioArgs, Scenario), AppError> {
+    let (mut arguments, mut loaded) = declare(scenario, &run.controllers)?;
+    for text in &run.on_exit {
         let (target, choice) = text.split_once('=').unwrap_or_default();
         let name = name_of(target);
         let choices = OnExit::ALL.map(OnExit::name).join(", ");
@@ -29,10 +26,37 @@ pub(super) fn load(
         }
         arguments.set.push(format!("controllers.{name}.on_exit=\"{}\"", choice.name()));
     }
-    if !on_exit.is_empty() {
+    if !run.on_exit.is_empty() {
+        loaded = arguments.load()?;
+    }
+    if run.reload {
+        arguments.set.extend(reloading(&loaded)?);
         loaded = arguments.load()?;
     }
     Ok((arguments, loaded))
+}
+
+/// What has controllers that may be started again be so, and the check that there is something to be watched.
+fn reloading(scenario: &Scenario) -> Result<Vec<String>, AppError> {
+    let mut set = Vec::new();
+    for Plugin { name, command, on_exit, .. } in &scenario.plugins {
+        let Some(command) = command.as_ref().filter(|_| matches!(on_exit, OnExit::End | OnExit::Restart))
+        else {
+            continue;
+        };
+        if Programs::of(command).is_none() {
+            let expected = "expected one that names an executable by its path, or a .py file";
+            return Err(AppError::Usage(format!(
+                "--reload: command of controller {name}, {command}: {expected}"
+            )));
+        }
+        set.push(format!("controllers.{name}.on_exit=\"{}\"", OnExit::Restart.name()));
+    }
+    if set.is_empty() {
+        let expected = "a controller with a command, and --on-exit end or restart";
+        return Err(AppError::Usage(format!("--reload: expected {expected}")));
+    }
+    Ok(set)
 }
 
 /// The name of the controller declared for a target.

@@ -53,6 +53,7 @@ pub(super) fn run_as(
         trace: None,
         world: None,
         debugged: None,
+        reloads: false,
     };
     let words = |e: AppError| e.to_string();
     let recording = match record {

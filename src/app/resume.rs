@@ -56,6 +56,7 @@ pub(super) fn resume(args: &ResumeArgs) -> Result<(), AppError> {
         trace: None,
         world: None,
         debugged: None,
+        reloads: false,
     };
     let lag = args.supervised.conduct.record_lag();
     let recording = match &args.record {

@@ -25,7 +25,7 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
     }
     let mut arguments = args.scenario.clone();
     arguments.set.extend(args.shield.iter().map(|mode| format!("shield={mode}")));
-    let (arguments, scenario) = controllers::load(&arguments, &args.controllers, &args.on_exit)?;
+    let (arguments, scenario) = controllers::load(&arguments, args)?;
     let scenario = Arc::new(scenario);
     args.share.check(&scenario)?;
     if args.supervised.conduct.wait_mode == WaitMode::Spin && !args.in_process {
@@ -44,7 +44,7 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
     }
     let debugged = debugged(args, &scenario)?;
     let mut conduct_args = args.supervised.conduct;
-    if debugged.is_some() {
+    if debugged.is_some() || args.reload {
         (conduct_args.wait.attach_timeout, conduct_args.wait.peer_timeout) = (WITHOUT_END, WITHOUT_END);
     }
     let bar = Bar::new(&scenario);
@@ -64,6 +64,7 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
         trace: args.trace.as_deref(),
         world: args.world.as_deref(),
         debugged,
+        reloads: args.reload,
     };
     let recording = match &args.record {
         Some(path) => {
@@ -81,7 +82,7 @@ pub(super) fn run(args: &RunArgs, traffic: Option<Box<dyn Traffic>>) -> Result<(
     })
 }
 
-/// No wait of a run that is debugged is longer than this.
+/// No wait of a run that somebody works at is longer than this.
 const WITHOUT_END: Duration = Duration::from_secs(86_400);
 
 /// Which of the plug-ins is debugged, if one is.

@@ -1,6 +1,6 @@
 //! What authors of controllers work with: `cz plugin replay`, `cz plugin new`, what a controller is shown beside states.
 
-use crate::common::TestRun;
+use crate::common::{TestRun, hash};
 use crate::{beside, cz, installed, python, root, rust};
 use serde_json::Value;
 use std::path::Path;
@@ -198,4 +198,55 @@ control_zones.run(Law(), joint=True)
     std::fs::write(&path, wrong).unwrap();
     let ended = driven(&python, &path, &[]);
     ended.expect(1, &["returned 3 lists; expected "]);
+}
+
+#[test]
+fn a_program_that_changes_is_started_again_and_the_run_replays() {
+    let Some(python) = python() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let (path, file) = (folder.path().join("law.py"), folder.path().join("run.czlog"));
+    let law = |speed: &str| {
+        let body = format!("def law(zone):\n    return ({speed} - zone.v).clip(-4, 4)\n");
+        std::fs::write(&path, format!("import control_zones\n{body}control_zones.run(law)\n")).unwrap();
+    };
+    law("15.0");
+    let test_run = TestRun::new("reload");
+    let controller = format!("merge-2={python} {}", path.display());
+    let own = ["--controller", controller.as_str(), "--reload", "--pace", "realtime", "--set", "dt_s=0.01"];
+    let rest = ["--set", "end.time_s=8", "--json", "-", "--record", file.to_str().unwrap()];
+    let run = test_run.start("cz", &[&own[..], &rest].concat());
+    let says = |words: &str| {
+        crate::common::wait_until(words, || run.said_so_far().1.contains(words));
+    };
+    let steps = || control_zones::record::Reader::open(&file).map_or(0, |r| r.steps().count());
+    crate::common::wait_until("the run to be stepping", || steps() > 20);
+    std::fs::write(&path, "def law(zone:\n").unwrap();
+    says("law.py has changed: controller merge-2 (process ");
+    says("it is started again when its program changes");
+    law("12.5");
+    says("law.py has changed: controller merge-2 is started again");
+    let ended = run.ended();
+    ended.expect(0, &["SyntaxError"]);
+    test_run.assert_clean();
+    let summary = ended.json();
+    let row = &summary["controllers"][0];
+    assert!(row["driven_by"] == "plugin" && row["on_exit"] == "restart" && row["exits"] == 1, "{row}");
+    let events = summary["events"].as_array().unwrap();
+    let kinds = events.iter().map(|event| event["kind"].as_str().unwrap());
+    // On a busy machine some steps are late too.
+    assert_eq!(
+        kinds.filter(|kind| *kind != "missed").collect::<Vec<_>>(),
+        ["exited", "replaced"],
+        "{summary}"
+    );
+    let replayed = cz().arg("replay").arg(&file).arg("--json").output().unwrap();
+    let said = String::from_utf8(replayed.stdout).unwrap();
+    assert!(replayed.status.success() && said.contains(&hash(&summary)), "{said} {summary}");
+    for (command, words) in [("true", "command of controller merge-2, true"), ("./nowhere", "--reload")] {
+        let controller = format!("merge-2={command}");
+        let run =
+            cz().args(["run", "--reload", "--controller", &controller]).assert().code(2).get_output().clone();
+        assert!(String::from_utf8_lossy(&run.stderr).contains(words), "{run:?}");
+    }
+    cz().args(["run", "--reload"]).assert().code(2);
 }

@@ -25,6 +25,10 @@ pub(in crate::app) struct RunArgs {
     /// limits as far as the shield allows).
     #[arg(long, value_name = "TARGET=CHOICE")]
     pub on_exit: Vec<String>,
+    /// Start such controllers again in the middle of the run when their programs change, unless `--on-exit` is builtin or
+    /// shield-fallback; one that dies soon waits for that, and the run with it.
+    #[arg(long, conflicts_with_all = ["in_process", "view"])]
+    pub reload: bool,
     /// Debug such a controller, e.g. `--debug merge-2`: it has the terminal, and no clock or timeout goes on while it is
     /// waited for.
     #[arg(long, value_name = "TARGET", conflicts_with_all = ["in_process", "view"])]

@@ -22,6 +22,8 @@ pub(super) const GRACE: Duration = Duration::from_secs(2);
 const KEEPER_GRACE: Duration = GRACE.saturating_mul(2);
 /// A part that dies this often, each time soon after it was started, is given up.
 const MAX_RESTARTS: u32 = 8;
+/// A plug-in that is started again when its program changes waits for that, rather, if it dies this often.
+const MAX_RELOADS: u32 = 1;
 /// A part that has lived this long has proved itself.
 const PROBATION: Duration = Duration::from_secs(5);
 /// The second restart in a row waits this long, each further one twice as long as the one before.
@@ -110,6 +112,12 @@ impl Life {
         self.members[member].on_exit = choice;
     }
 
+    /// A plug-in is started again when its program changes; one that dies soon after it was started waits for that.
+    pub fn reloads(&mut self, member: usize) {
+        let member = &mut self.members[member];
+        (member.reloads, member.restarts) = (true, MAX_RELOADS);
+    }
+
     /// It runs as this process.
     pub fn started(&mut self, member: usize, id: u32, now: Now) {
         let member = &mut self.members[member];
@@ -170,6 +178,28 @@ impl Life {
         }
     }
 
+    /// A file of a plug-in's program has changed.
+    pub fn changed(&mut self, member: usize, file: &str, now: Now, acts: &mut Vec<Act>) {
+        let it = &mut self.members[member];
+        if !matches!(self.phase, Phase::Running) || !it.reloads {
+            return;
+        }
+        match &mut it.process {
+            Process::Runs { id, asked: asked @ None, .. } => {
+                *asked = Some(now);
+                it.is_renewed = true;
+                let text = format!("cz: {file} has changed: {} (process {id}) is started again", it.name);
+                acts.extend([Act::Say(text), Act::Ask(member)]);
+            }
+            Process::Awaits => {
+                acts.push(Act::Say(format!("cz: {file} has changed: {} is started again", it.name)));
+                it.process = Process::Due { at: now };
+            }
+            // Otherwise it is about to be started anyway, or to end.
+            _ => {}
+        }
+    }
+
     /// A plug-in had this generation when all was over; one that was started more often than that was on its way.
     pub fn came_to(&mut self, name: &str, generation: u32) {
         let plugins = self.members.iter_mut().filter(|m| m.kind == Kind::Plugin && m.name == name);
@@ -189,7 +219,7 @@ impl Life {
             Phase::Failed { .. } | Phase::Running => {}
         }
         for member in &mut self.members {
-            if matches!(member.process, Process::Due { .. } | Process::Left { .. }) {
+            if matches!(member.process, Process::Due { .. } | Process::Left { .. } | Process::Awaits) {
                 member.process = Process::Ended;
             }
         }
@@ -251,6 +281,10 @@ impl Life {
                 } else if is_news {
                     self.add_words(&told);
                 }
+            }
+            Phase::Running if it.is_renewed => {
+                (it.is_renewed, it.restarts) = (false, MAX_RELOADS);
+                it.process = Process::Due { at: now };
             }
             Phase::Running if *end == End::Code(0) && it.kind != Kind::World => {
                 it.process = Process::Left { id, at: now };
@@ -315,6 +349,7 @@ impl Life {
             Kind::Part => self.replaces,
             Kind::Plugin => it.on_exit == OnExit::Restart,
         };
+        let most = if it.reloads { MAX_RELOADS } else { MAX_RESTARTS };
         let in_a_row = if now.saturating_sub(since) >= PROBATION { 0 } else { it.restarts };
         if let Some(hangs) = hangs {
             self.fail(Failure::Failed(format!("{hangs}\n  {told}")), now);
@@ -327,7 +362,11 @@ impl Life {
             acts.push(Act::StandIn(member));
         } else if it.kind == Kind::Plugin && it.on_exit == OnExit::ShieldFallback && steps {
             acts.push(Act::Say(format!("cz: {told}; the shield drives its vehicles from now on")));
-        } else if starts_again && !deliberate && in_a_row < MAX_RESTARTS {
+        } else if it.reloads && in_a_row >= most {
+            it.process = Process::Awaits;
+            let text = format!("cz: {told}; it is started again when its program changes");
+            acts.push(Act::Say(text));
+        } else if starts_again && !deliberate && in_a_row < most {
             let pause = if in_a_row == 0 { Duration::ZERO } else { BACK_OFF * (1 << (in_a_row - 1)) };
             it.restarts = in_a_row + 1;
             it.process = Process::Due { at: now + pause };

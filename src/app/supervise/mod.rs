@@ -5,6 +5,7 @@
 mod child;
 mod keep;
 mod life;
+mod programs;
 
 use super::args::{ConductArgs, Restart, ScenarioArgs, ShareArgs};
 use super::lines::{PartLine, WorldLine};
@@ -18,13 +19,14 @@ use crate::process::{
     Observation, Outcome, ProcessError, Settled, children_of, is_orphaned, is_stopped, signals_to_heed,
 };
 use crate::record::Reader;
-use crate::scenario::Plugin;
+use crate::scenario::{OnExit, Plugin};
 use crate::trace;
 use crate::transport::iox::{RunName, RunSpace, clean};
 use child::{Event, Stdout};
 use crossbeam::channel::{Receiver, Sender, bounded, select, unbounded};
 pub(super) use keep::keep;
 use life::{Act, Failure, GRACE, Kind, Life, Stage};
+pub(super) use programs::Programs;
 use rustix::process::{Resource, Signal, getpid, getrlimit, set_child_subreaper};
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -52,8 +54,21 @@ pub(super) struct Plan<'a> {
     pub world: Option<&'a str>,
     /// The plug-in that is debugged.
     pub debugged: Option<usize>,
+    /// Whether plug-ins that may be started again are when their programs change.
+    pub reloads: bool,
 }
 
+impl Plan<'_> {
+    /// How long a plug-in may take to end once the run is over.
+    fn linger(&self) -> Duration {
+        // Whoever debugs one may look at it for as long as others wait.
+        let longest = if self.debugged.is_some() { Duration::MAX } else { LONGEST_LINGER };
+        self.conduct.wait.peer_timeout.min(longest)
+    }
+}
+
+/// No plug-in takes longer than this to end.
+const LONGEST_LINGER: Duration = Duration::from_secs(60);
 /// Events that may wait to be dealt with: whoever floods us waits.
 const WAITING: usize = 1024;
 /// The clock is looked at this often.
@@ -193,6 +208,8 @@ struct Recipe {
     controller: Option<u32>,
     /// Whether it is debugged, and so has the terminal.
     has_terminal: bool,
+    /// Of a plug-in that is started again when it changes: its program.
+    programs: Option<Programs>,
     /// The process that was started so last.
     process: Option<u32>,
     /// Where it is and what it was granted.
@@ -211,6 +228,8 @@ struct Children {
     outcome: Option<Outcome>,
     /// What those that have ended had refused.
     refused: Vec<RefusedFrames>,
+    /// When it was looked last whether programs have changed.
+    looked_at_programs: Duration,
 }
 
 impl Children {
@@ -234,7 +253,7 @@ impl Children {
         let (events, inbox) = bounded(WAITING);
         let replaces = plan.conduct.restart == Restart::OnFailure;
         let mut children = Children {
-            life: Life::new(replaces, plan.conduct.wait.peer_timeout),
+            life: Life::new(replaces, plan.linger()),
             recipes: Vec::new(),
             events,
             inbox,
@@ -243,6 +262,7 @@ impl Children {
             crier: Crier::start().map_err(no_thread)?,
             outcome: None,
             refused: Vec::new(),
+            looked_at_programs: Duration::ZERO,
         };
         children.cast(plan, observed);
         Ok(children)
@@ -302,6 +322,10 @@ impl Children {
                 Some((stand_in.into_iter().map(OsString::from).collect(), traced.clone()));
             self.life.on_exit(member, *on_exit);
             self.recipes[member].has_terminal = has_terminal;
+            if plan.reloads && *on_exit == OnExit::Restart {
+                self.recipes[member].programs = Programs::of(command);
+                self.life.reloads(member);
+            }
             self.recipes[member].controller = Some(plan.pool + plugin as u32);
         }
     }
@@ -322,6 +346,7 @@ impl Children {
             stand_in: None,
             controller: None,
             has_terminal: false,
+            programs: None,
             process: None,
             settled: None,
         };
@@ -373,9 +398,23 @@ impl Children {
     fn go_on(&mut self) -> Stage {
         let now = self.time.look(2 * LOOK);
         let mut acts = Vec::new();
+        self.look_at_programs(now, &mut acts);
         self.life.tick(now, &mut acts);
         self.act(acts);
         self.life.stage()
+    }
+
+    /// Looks, now and then, whether programs have changed.
+    fn look_at_programs(&mut self, now: Duration, acts: &mut Vec<Act>) {
+        if now.saturating_sub(self.looked_at_programs) < programs::LOOK {
+            return;
+        }
+        self.looked_at_programs = now;
+        for (member, recipe) in self.recipes.iter_mut().enumerate() {
+            if let Some(file) = recipe.programs.as_mut().and_then(Programs::changed) {
+                self.life.changed(member, &file.display().to_string(), now, acts);
+            }
+        }
     }
 
     fn act(&mut self, acts: Vec<Act>) {
@@ -435,7 +474,9 @@ impl Children {
     /// Waits for something to happen, and takes it.
     fn take_event(&mut self, progress: &mut impl FnMut(Position)) {
         let now = self.time.look(2 * LOOK);
-        let patience = self.life.next_due().map_or(LOOK, |due| due.saturating_sub(now).min(LOOK));
+        let is_watched = self.recipes.iter().any(|recipe| recipe.programs.is_some());
+        let longest = if is_watched { programs::LOOK } else { LOOK };
+        let patience = self.life.next_due().map_or(longest, |due| due.saturating_sub(now).min(longest));
         select! {
             recv(self.signals) -> signal => {
                 let name = signal.ok().and_then(signal_hook::low_level::signal_name).unwrap_or("a signal");
@@ -486,9 +527,10 @@ impl Children {
             (Kind::Plugin, Some(PartLine::Keeps(plugin))) => {
                 if self.recipes[member].has_terminal {
                     let name = self.life.name(member);
+                    // The shell that it was started by may be there too, and is no use to anybody.
                     self.crier.cry(format!(
-                        "cz: {name} (process {plugin}) has the terminal, and the run waits for it; from another one: \
-                         gdb -p {plugin}, lldb -p {plugin}, or for Python py-spy dump --pid {plugin}"
+                        "cz: {name} has the terminal, and the run waits for it; from another one: \
+                         gdb -p $(pgrep -ng {plugin}), and lldb or py-spy dump likewise"
                     ));
                 }
                 return self.life.is_process(member, plugin);

@@ -32,6 +32,8 @@ pub(super) enum Process {
     },
     /// The shell has been told to start it.
     Starting,
+    /// It is to be started once its program has changed.
+    Awaits,
     Runs {
         id: u32,
         since: Now,
@@ -59,6 +61,10 @@ pub(super) struct Member {
     pub kind: Kind,
     /// Of a plug-in: what becomes of its vehicles without it.
     pub on_exit: OnExit,
+    /// Of a plug-in: whether it is started again when its program changes.
+    pub reloads: bool,
+    /// Whether it has been asked to end for that.
+    pub is_renewed: bool,
     pub process: Process,
     /// How often it has been started.
     pub starts: u32,
@@ -79,6 +85,8 @@ impl Member {
             name,
             kind,
             on_exit: OnExit::End,
+            reloads: false,
+            is_renewed: false,
             process: Process::Due { at: Now::ZERO },
             starts: 0,
             is_late: false,

@@ -287,3 +287,40 @@ fn a_plug_in_on_its_way_when_all_was_over_is_ended_without_a_word() {
     run.ends(3, End::Signal(15, "SIGTERM"), 21.0);
     assert_eq!(run.said(21.0), "");
 }
+
+#[test]
+fn a_plug_in_whose_program_changes_is_started_again_and_one_that_dies_soon_waits_for_that() {
+    let mut run = Scene::new();
+    run.life.on_exit(3, OnExit::Restart);
+    run.life.reloads(3);
+    run.life.stepped(s(1.0));
+    let changed = |run: &mut Scene, at: f64| {
+        let mut acts = Vec::new();
+        run.life.changed(3, "law.py", s(at), &mut acts);
+        acts
+    };
+    let says = |text: &str| Act::Say(format!("cz: {text}"));
+    let renewed = says("law.py has changed: controller mine (process 103) is started again");
+    assert_eq!(changed(&mut run, 2.0), [renewed, Act::Ask(3)]);
+    // Whoever changes it twice has it started once.
+    assert_eq!(changed(&mut run, 2.1), []);
+    run.ends(3, End::Code(0), 2.2);
+    assert_eq!(run.at(2.2), [Act::Start(3)]);
+    // The new one is of no use: nobody starts it over and over.
+    run.life.started(3, 203, s(2.2));
+    run.ends(3, End::Code(1), 2.5);
+    let waits =
+        "controller mine (process 203) ended with code 1; it is started again when its program changes";
+    assert_eq!((run.at(60.0), run.life.stage()), (vec![says(waits)], Stage::Going));
+    assert_eq!(changed(&mut run, 60.0), [says("law.py has changed: controller mine is started again")]);
+    assert_eq!(run.at(60.0), [Act::Start(3)]);
+    // One that has lived for a while is started again as ever.
+    run.life.started(3, 303, s(60.0));
+    run.ends(3, KILLED, 80.0);
+    assert_eq!(run.at(80.0)[1], Act::Start(3));
+    // Nobody waits for a change when all is over.
+    run.life.started(3, 403, s(80.0));
+    run.ends(3, End::Code(1), 80.1);
+    run.finishes(81.0);
+    assert_eq!(changed(&mut run, 81.1), []);
+}
