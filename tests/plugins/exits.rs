@@ -52,6 +52,14 @@ fn killed(choice: &str, seed: u64) -> String {
     let mut victims = Vec::new();
     for _ in 0..if choice == "restart" { rng.random_range(1..=3) } else { 1 } {
         let Some(victim) = controller(&supervisor, &command, &victims) else { break };
+        if !seed.is_multiple_of(4) {
+            // Otherwise many are killed before the run has begun, on a busy machine most.
+            wait_until("the run to be stepping", || {
+                let is_stepping =
+                    control_zones::record::Reader::open(&file).is_ok_and(|r| r.steps().next().is_some());
+                is_stepping || !common::is_alive(supervisor.id())
+            });
+        }
         std::thread::sleep(Duration::from_millis(rng.random_range(0..250)));
         kill(victim);
         victims.push(victim);
