@@ -1,4 +1,4 @@
-//! Writes the C header and the Python module, or with `--check` tells which of them is stale.
+//! Writes the C header, the Python module and docs/records.md, or with `--check` tells which of them is stale.
 
 use std::path::Path;
 use std::process::ExitCode;

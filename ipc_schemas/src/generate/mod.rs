@@ -1,10 +1,11 @@
-//! The C header and the Python module, written from [`LAYOUTS`](crate::LAYOUTS) and
+//! The C header, the Python module and a document, written from [`LAYOUTS`](crate::LAYOUTS) and
 //! [`CODES`](crate::CODES).
 //!
 //! `cargo run -p ipc_schemas` writes the files; they are checked in, so that users of either language
 //! need no Rust, and a test compares them with what would be written now.
 
 mod c_header;
+mod markdown;
 mod python_module;
 
 /// First line of each generated file, behind the language's comment sign.
@@ -23,12 +24,13 @@ pub struct GeneratedFile {
 }
 
 /// The generated files as they should be.
-pub fn files() -> [GeneratedFile; 3] {
+pub fn files() -> [GeneratedFile; 4] {
     [
         GeneratedFile { path: "include/cz_schemas.h", contents: c_header::render() },
         GeneratedFile { path: "python/cz_schemas.py", contents: python_module::render() },
         // A copy: a Python package cannot take in files from outside its directory.
         GeneratedFile { path: "../sdk/python/control_zones/_schemas.py", contents: python_module::render() },
+        GeneratedFile { path: "../docs/records.md", contents: markdown::render() },
     ]
 }
 
