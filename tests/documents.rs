@@ -188,6 +188,13 @@ impl Program {
                 siblings.insert(*sibling, sources_in(folder));
                 continue;
             }
+            // What is in Python declares its arguments as they are written.
+            if ["sumo", "import"].contains(&name.as_str()) {
+                let declared =
+                    std::fs::read_to_string(root().join("sdk/python/control_zones/sumo/command.py")).unwrap();
+                flags.insert(name, flags_in(&declared));
+                continue;
+            }
             let text = help(&[&name]);
             for inner in listed(&text) {
                 flags.insert(format!("{name} {inner}"), flags_in(&help(&[&name, &inner])));

@@ -48,7 +48,7 @@ impl Traffic for Obedient {
         Ok(Coming::Nobody)
     }
 
-    fn admit(&mut self, vehicles: &[Admitted]) -> Result<(), TrafficError> {
+    fn admit(&mut self, vehicles: &mut [Admitted]) -> Result<(), TrafficError> {
         for admitted in vehicles {
             assert!(self.speeds_mps.insert(admitted.vehicle, admitted.v_mps).is_none(), "each comes once");
         }
@@ -144,7 +144,7 @@ impl Traffic for Scripted {
         Ok(if self.coming.iter().any(|(when, _)| *when > step) { Coming::More } else { Coming::Nobody })
     }
 
-    fn admit(&mut self, _vehicles: &[Admitted]) -> Result<(), TrafficError> {
+    fn admit(&mut self, _vehicles: &mut [Admitted]) -> Result<(), TrafficError> {
         unreachable!("it brings its vehicles itself")
     }
 }

@@ -1,12 +1,15 @@
-//! Control Zones as an environment to learn in: many runs in one thread, behind a C ABI for `control_zones.env`.
+//! Control Zones behind a C ABI: as an environment to learn in, many runs in one thread, for `control_zones.env`; and with a world
+//! that is played from outside, for `control_zones.world`.
 //!
 //! All unsafe code is here. Its common argument: a handle comes from [`cz_env_new`] and is used by one thread at a time
 //! until [`cz_env_free`]; strings end with a zero; buffers have the sizes that the description names.
 
 mod envs;
+mod played;
 mod run;
 
 pub use envs::{End, EnvError, Envs};
+pub use played::{AdmittedVehicle, Callbacks, cz_world_run, cz_world_scenario};
 pub use run::{FEATURES, Run, RunError};
 
 use std::cell::RefCell;

@@ -16,6 +16,7 @@ from pathlib import Path
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/python/cruise.py"
 ENVIRONMENTS = Path(__file__).resolve().with_name("check_env.py")
 SWEEPS = Path(__file__).resolve().with_name("check_sweep.py")
+SUMO = Path(__file__).resolve().with_name("check_sumo.py")
 PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-sweep", "cz-view", "cz-top")
 
 
@@ -75,7 +76,9 @@ def check(wheel: Path, place: Path) -> None:
     empty.ran("cz sweep of 20 runs", "cz", "sweep", "paper-none", "--scenario", "paper", "--seeds", "20")
     empty.ran("what sweeps on a cluster need installed", *install, f"{wheel}[dask]")
     print(empty.ran("the same sweep by cz and by Dask", "python", "-I", str(SWEEPS)), end="")
-    for program in ("cz-view", "cz-top", "cz-world", "cz-coord", "cz-ctrl"):
+    empty.ran("what SUMO as world needs installed", *install, f"{wheel}[sumo]")
+    print(empty.ran("SUMO as world", "python", "-I", str(SUMO), "cz"), end="")
+    for program in ("cz-view", "cz-top", "cz-sumo", "cz-world", "cz-coord", "cz-ctrl"):
         empty.ran(f"{program} --help", program, "--help")
 
 

@@ -156,6 +156,8 @@ pub fn cz() -> ExitCode {
             args::Command::Sweep(args) => sibling::SWEEP.run(&args.arguments),
             args::Command::Export(args) => sibling::EXPORT.run(&args.arguments),
             args::Command::Report(args) => sibling::REPORT.run(&args.arguments),
+            args::Command::Sumo(args) => sibling::sumo(&args.arguments),
+            args::Command::Import(args) => sibling::import(&args.arguments),
             args::Command::View(args) => sibling::VIEW.run(&args.arguments),
             args::Command::Top(args) => sibling::TOP.run(&args.arguments),
         },

@@ -254,11 +254,9 @@ impl Summary {
                 self.held_arrivals, self.waiting
             ));
         }
-        if self.arrived > self.departed {
-            text.push_str(&format!(
-                "{} vehicles were still inside at the end\n",
-                self.arrived - self.departed
-            ));
+        let gone = self.departed + self.traffic.as_ref().map_or(0, |traffic| traffic.gone);
+        if self.arrived > gone {
+            text.push_str(&format!("{} vehicles were still inside at the end\n", self.arrived - gone));
         }
         shield_lines(&self.shield, &mut text);
         for warning in self.warnings() {

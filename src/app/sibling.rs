@@ -25,6 +25,43 @@ pub(super) const SWEEP: Sibling = Sibling { program: "cz-sweep", package: "cz-sw
 /// `cz report`.
 pub(super) const REPORT: Sibling = Sibling { program: "cz-report", package: "cz-export" };
 
+/// What a Python runs for `cz sumo`; a package that is missing is named in a line.
+const SUMO_SCRIPT: &str = "import sys\n\
+    try:\n    from control_zones import Error, sumo\n\
+    except ImportError:\n    sys.exit(f'cz sumo: {sys.executable} has no package control-zones with SUMO; '\n\
+    \x20       \"pip install 'control-zones[sumo]', or name another Python in CZ_PYTHON\")\n\
+    try:\n    from control_zones.sumo.command import main\n\
+    except Error as error:\n    sys.exit(f'cz sumo: {error}')\n\
+    sys.exit(main())";
+
+/// `cz sumo`, which is in the Python package: becomes `cz-sumo` beside this program, where the package has put it, or a
+/// Python.
+pub(super) fn sumo(arguments: &[OsString]) -> Result<(), AppError> {
+    let beside =
+        std::env::current_exe().ok().map(|own| own.with_file_name("cz-sumo")).filter(|p| p.is_file());
+    let mut command = match beside {
+        Some(program) => Command::new(program),
+        None => {
+            let mut command = Command::new(std::env::var_os("CZ_PYTHON").unwrap_or_else(|| "python3".into()));
+            command.args(["-c", SUMO_SCRIPT]);
+            command
+        }
+    };
+    let error = command.args(arguments).exec();
+    Err(AppError::Usage(format!("cannot start a Python for cz sumo: {error}")))
+}
+
+/// `cz import sumo NET`: `cz sumo import NET`.
+pub(super) fn import(arguments: &[OsString]) -> Result<(), AppError> {
+    match arguments.split_first() {
+        Some((format, rest)) if format == "sumo" => {
+            let own: Vec<OsString> = std::iter::once("import".into()).chain(rest.iter().cloned()).collect();
+            sumo(&own)
+        }
+        _ => Err(AppError::Usage("expected `cz import sumo NET.xml`".to_owned())),
+    }
+}
+
 impl Sibling {
     /// Becomes that program; returns only why it cannot.
     pub fn run(self, arguments: &[OsString]) -> Result<(), AppError> {

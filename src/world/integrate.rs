@@ -333,7 +333,9 @@ impl World {
                 if let Some(played) = &mut self.played {
                     let (kind, way) = (u32::from(kind), ways.whole(way, id, zone));
                     let Car { x_m, v_mps, .. } = car;
-                    played.admitted.push(Admitted { vehicle: id, kind, road, x_m, v_mps, way });
+                    let is_commanded = true;
+                    let admitted = Admitted { vehicle: id, kind, road, x_m, v_mps, way, is_commanded };
+                    played.admitted.push(admitted);
                 }
                 self.scratch.entries.push(Entry { zone, car });
                 leader = Some((held, kind));

@@ -84,6 +84,8 @@ pub struct Admitted {
     pub v_mps: f64,
     /// Zones and paths on its way out of the network.
     pub way: Vec<(u32, u32)>,
+    /// Whether it does what it is commanded, which it does unless the traffic says otherwise here.
+    pub is_commanded: bool,
 }
 
 /// Whether a traffic has more to bring.
@@ -122,11 +124,12 @@ pub trait Traffic: std::fmt::Debug {
         newcomers: &mut Vec<Newcomer>,
     ) -> Result<Coming, TrafficError>;
 
-    /// Puts vehicles where the world's gates have let them in, at the end of the step just made.
+    /// Puts vehicles where the world's gates have let them in, at the end of the step just made, and says which of them
+    /// are not commanded.
     ///
     /// # Errors
     /// When it cannot; the run fails.
-    fn admit(&mut self, vehicles: &[Admitted]) -> Result<(), TrafficError>;
+    fn admit(&mut self, vehicles: &mut [Admitted]) -> Result<(), TrafficError>;
 }
 
 /// Why the world cannot go on to the next step.
@@ -384,8 +387,18 @@ impl World {
         }
         let result = match played.admitted.is_empty() {
             true => Ok(()),
-            false => played.traffic.admit(&played.admitted).map_err(|error| played.explain(error)),
+            false => played.traffic.admit(&mut played.admitted).map_err(|error| played.explain(error)),
         };
+        for admitted in played.admitted.iter().filter(|admitted| !admitted.is_commanded) {
+            played.summary.uncommanded += 1;
+            let zone = admitted.way[0].0 as usize;
+            let first = self.zones[zone].first();
+            let members = &mut self.cars[zone][first..];
+            members
+                .iter_mut()
+                .filter(|car| car.vehicle == admitted.vehicle)
+                .for_each(|car| car.is_commanded = false);
+        }
         played.admitted.clear();
         self.played = Some(played);
         result

@@ -24,7 +24,6 @@ import ctypes
 import json
 import os
 import typing
-from pathlib import Path
 
 import gymnasium
 import numpy
@@ -35,6 +34,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from ._features import FEATURES
+from ._library import load as _load
 from ._session import Error
 
 if typing.TYPE_CHECKING:
@@ -45,8 +45,6 @@ __all__ = ["ZoneEnv", "ZoneVectorEnv", "ZonesEnv"]
 Floats = NDArray[numpy.float64]
 Info = dict[str, typing.Any]
 
-#: The library with the runs, beside this file in a wheel that has it; `CZ_ENV_LIBRARY` names another.
-_LIBRARY = "libcontrol_zones_env.so"
 #: Vehicles of a zone in an observation, unless told otherwise.
 CAPACITY = 32
 #: How a run stands after a step.
@@ -54,14 +52,7 @@ _SERVED, _OUT_OF_TIME = 1, 2
 
 
 def _library() -> ctypes.CDLL:
-    path = os.environ.get("CZ_ENV_LIBRARY") or str(Path(__file__).with_name(_LIBRARY))
-    try:
-        library = ctypes.CDLL(path)
-    except OSError as error:
-        raise Error(
-            f"{error}; install a wheel with the programs, or build it with `cargo build --release -p control-zones-env` "
-            f"and name target/release/{_LIBRARY} in CZ_ENV_LIBRARY"
-        ) from error
+    library = _load()
     handle, text, number = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint32
     for name, result, arguments in (
         ("error", text, []),

@@ -82,6 +82,12 @@ pub(super) enum Command {
     /// Make one page of recordings: tables, map, figures, events (the program cz-report).
     #[command(disable_help_flag = true, disable_version_flag = true)]
     Report(SiblingArgs),
+    /// SUMO as the world of a run, or a scenario in SUMO (the Python package control-zones[sumo]).
+    #[command(disable_help_flag = true, disable_version_flag = true)]
+    Sumo(SiblingArgs),
+    /// Make a scenario of other tools' networks: `cz import sumo NET.xml`.
+    #[command(disable_help_flag = true, disable_version_flag = true)]
+    Import(SiblingArgs),
     /// What controllers in C and C++ are built against.
     Sdk {
         #[command(subcommand)]

@@ -1,0 +1,220 @@
+"""A scenario of our own as a SUMO network, and SUMO as its world."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import typing
+import xml.etree.ElementTree as ElementTree
+
+import libsumo
+
+from .._session import Error
+from ..world import GONE, Admitted, Newcomer, Traffic
+from .network import Place, cut
+from .simulation import Simulation, is_automated, program
+
+if typing.TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+#: Of ways that are one lane up to their merge, so much is within the junction, m.
+MERGE_M = 5.0
+#: What is beyond the last zone, m.
+BEYOND_M = 400.0
+
+
+def between(line: Sequence[Place], start: float, end: float) -> list[Place]:
+    """What of a line is between two shares of its length."""
+    behind = cut(line, start)
+    return cut(behind[::-1], 1.0 - (end - start) / (1.0 - start))[::-1] if end < 1.0 else behind
+
+
+def draw(path: str, roads: dict[str, Sequence[Place]], ways: dict[tuple[str, str], Sequence[Place]]) -> None:
+    """Puts lanes where the scenario has them: netconvert pulls roads together to the middle of their junction."""
+    tree = ElementTree.parse(path)
+    root = tree.getroot()
+    lanes = {lane.get("id", ""): lane for lane in root.iter("lane")}
+    onward = {(one.get("from", ""), one.get("to", "")): one.get("via") for one in root.iter("connection")}
+    shapes = {f"{edge}_0": line for edge, line in roads.items()}
+    for (start, end), line in ways.items():
+        # A way may be several lanes: SUMO has drivers wait between them.
+        chain, via = [], onward.get((start, end))
+        while via:
+            chain.append(via)
+            via = onward.get((via.rsplit("_", 1)[0], end))
+        whole_m = sum(float(lanes[lane].get("length", 0.0)) for lane in chain)
+        from_m = 0.0
+        for lane in chain:
+            to_m = from_m + float(lanes[lane].get("length", 0.0))
+            shapes[lane] = between(line, from_m / whole_m, min(1.0, to_m / whole_m + 1e-9))
+            from_m = to_m
+    for name, line in shapes.items():
+        lanes[name].set("shape", " ".join(f"{x:.3f},{y:.3f}" for x, y in line))
+    tree.write(path)
+
+
+class Replica:
+    """The network of a scenario as edges: one for each entrance, one for what is behind each last exit."""
+
+    def __init__(self, described: dict[str, typing.Any]) -> None:
+        self.network = described["scenario"]["network"]
+        self.shapes = described["shapes"]
+        self.v_max_mps = float(described["scenario"]["vehicle"]["v_max_mps"])
+
+    def entrance(self, zone: int, path: int) -> int:
+        """The first segment of a path."""
+        return int(self.network["zones"][zone]["paths"][path]["segments"][0])
+
+    def inside_m(self, zone: int, segment: int) -> float:
+        """How much of an entrance is within the junction, m."""
+        paths = self.network["zones"][zone]["paths"]
+        return MERGE_M if any(path["segments"] == [segment] for path in paths) else 0.0
+
+    def edges(self, way: Iterable[tuple[int, int]]) -> list[str]:
+        """The edges of a way."""
+        way = list(way)
+        last, path = way[-1]
+        exit_ = self.network["zones"][last]["paths"][path]["exit"]
+        return [*(f"z{zone}s{self.entrance(zone, path)}" for zone, path in way), f"z{last}x{exit_}"]
+
+    def write(self, folder: str, junctions: str) -> str:
+        """Has netconvert make the network; returns its path."""
+        nodes, edges, connections = ["<nodes>"], ["<edges>"], ["<connections>"]
+        roads: dict[str, Sequence[Place]] = {}
+        ways: dict[tuple[str, str], Sequence[Place]] = {}
+        for zone, shape in enumerate(self.network["zones"]):
+            segments, lines = shape["segments"], self.shapes[zone]
+            middle = lines[shape["paths"][0]["segments"][-1]][-1]
+            if len(shape["paths"]) > len(shape["exits"]) and shape["crossings"]:
+                ends = [lines[path["segments"][-1]][-1] for path in shape["paths"]]
+                middle = [sum(end[axis] for end in ends) / len(ends) for axis in (0, 1)]
+            nodes.append(f'<node id="z{zone}" x="{middle[0]:.2f}" y="{middle[1]:.2f}" type="{junctions}"/>')
+            starts = [index for index, segment in enumerate(segments) if segment["source"] is not None]
+            for rank, at in enumerate(starts):
+                source, line = segments[at]["source"], lines[at]
+                own_m = float(segments[at]["length_m"]) - self.inside_m(zone, at)
+                begin = f"z{zone}s{at}o"
+                link_m = 0.0
+                if "Zone" in source:
+                    begin = f"z{source['Zone']['zone']}"
+                    upstream = self.network["zones"][source["Zone"]["zone"]]
+                    link_m = float(upstream["exits"][source["Zone"]["exit"]]["to"]["link_m"])
+                else:
+                    nodes.append(f'<node id="{begin}" x="{line[0][0]:.2f}" y="{line[0][1]:.2f}"/>')
+                # The first that is named has the right of way, where SUMO decides.
+                priority = 2 if rank == 0 and not shape["crossings"] else 1
+                whole_m = float(segments[at]["length_m"])
+                drawn = between(line, 0.0, 1.0 - self.inside_m(zone, at) / whole_m)
+                roads[f"z{zone}s{at}"] = drawn
+                edges.append(
+                    f'<edge id="z{zone}s{at}" from="{begin}" to="z{zone}" numLanes="1" speed="{self.v_max_mps}" '
+                    f'length="{own_m + link_m:.6f}" priority="{priority}" spreadType="center"/>'
+                )
+            for index, exit_ in enumerate(shape["exits"]):
+                if exit_["to"] is None:
+                    path = next(path for path in shape["paths"] if path["exit"] == index)
+                    line = lines[path["segments"][-1]]
+                    (ax, ay), (bx, by) = line[-2], line[-1]
+                    long_m = math.dist((ax, ay), (bx, by)) or 1.0
+                    x, y = bx + (bx - ax) / long_m * BEYOND_M, by + (by - ay) / long_m * BEYOND_M
+                    roads[f"z{zone}x{index}"] = [(bx, by), (x, y)]
+                    nodes.append(f'<node id="z{zone}x{index}o" x="{x:.2f}" y="{y:.2f}"/>')
+                    edges.append(
+                        f'<edge id="z{zone}x{index}" from="z{zone}" to="z{zone}x{index}o" numLanes="1" '
+                        f'speed="{self.v_max_mps}" length="{BEYOND_M}" priority="2" spreadType="center"/>'
+                    )
+            for path in shape["paths"]:
+                first, inner = path["segments"][0], path["segments"][1:]
+                inside_m = self.inside_m(zone, first)
+                own_m = float(segments[first]["length_m"])
+                line = [tuple(place) for place in lines[first]]
+                drawn = cut(line, 1.0 - inside_m / own_m) if inside_m else []
+                for segment in inner:
+                    drawn += [tuple(place) for place in lines[segment] if not drawn or tuple(place) != drawn[-1]]
+                inside_m += sum(float(segments[segment]["length_m"]) for segment in inner)
+                exit_ = shape["exits"][path["exit"]]["to"]
+                to = f"z{zone}x{path['exit']}" if exit_ is None else f"z{exit_['zone']}s{exit_['segment']}"
+                ways[f"z{zone}s{first}", to] = drawn
+                connections.append(
+                    f'<connection from="z{zone}s{first}" to="{to}" fromLane="0" toLane="0" length="{inside_m:.6f}" '
+                    f'speed="{self.v_max_mps}"/>'
+                )
+        base = os.path.join(folder, "replica")
+        for name, lines_ in (("nod", [*nodes, "</nodes>"]), ("edg", [*edges, "</edges>"]), ("con", [*connections, "</connections>"])):
+            with open(f"{base}.{name}.xml", "w") as file:
+                file.write("\n".join(lines_) + "\n")
+        command = [program("netconvert"), "-n", f"{base}.nod.xml", "-e", f"{base}.edg.xml", "-x", f"{base}.con.xml"]
+        command += ["-o", f"{base}.net.xml", "--no-turnarounds", "true", "--no-warnings", "true", "--precision", "6"]
+        command += ["--tls.default-type", "actuated", "--offset.disable-normalization", "true"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode != 0:
+            raise Error(f"netconvert: {(done.stderr or done.stdout).strip()}")
+        draw(f"{base}.net.xml", roads, ways)
+        return f"{base}.net.xml"
+
+
+class ReplicaTraffic(Traffic):
+    """SUMO moves the vehicles that a scenario's own gates let in."""
+
+    name = "sumo"
+    brings = False
+
+    def __init__(self, replica: Replica, scenario: dict[str, typing.Any], simulation: Simulation, share: float) -> None:
+        self.replica, self.simulation, self.share = replica, simulation, share
+        self.seed = int(scenario["seed"])
+        self.fleet = scenario["fleet"]
+        self.routes: dict[tuple[str, ...], str] = {}
+        for index, kind in enumerate(self.fleet):
+            self.add_types(index, kind["vehicle"])
+
+    def add_types(self, index: int, vehicle: dict[str, float]) -> None:
+        """SUMO's types of a kind: one that is automated, and one that SUMO's default driver drives."""
+        types = libsumo.vehicletype
+        for name in (f"cav{index}", f"human{index}"):
+            types.copy("DEFAULT_VEHTYPE", name)
+            types.setLength(name, vehicle["length_m"])
+            types.setMaxSpeed(name, vehicle["v_max_mps"])
+        types.setAccel(f"cav{index}", vehicle["u_max_mps2"])
+        types.setDecel(f"cav{index}", -vehicle["u_min_mps2"])
+        types.setEmergencyDecel(f"cav{index}", -vehicle["u_min_mps2"])
+        types.setMinGap(f"cav{index}", 0.0)
+        types.setImperfection(f"cav{index}", 0.0)
+
+    def step(self, step: int, tasks: Sequence[tuple[float, int, int]]) -> tuple[Iterable[float], Sequence[Newcomer], bool]:
+        """One step of SUMO."""
+        simulation = self.simulation
+        for u_mps2, vehicle, is_held in tasks:
+            name = str(vehicle)
+            if is_held:
+                simulation.hold(name, u_mps2)
+            else:
+                simulation.release(name)
+        simulation.step()
+        did: list[float] = []
+        for _, vehicle, _ in tasks:
+            did.extend(simulation.moved(str(vehicle)) or GONE)
+        return did, (), False
+
+    def admit(self, vehicles: Sequence[Admitted]) -> Sequence[bool]:
+        """Puts them on their first edge."""
+        commanded = []
+        for x_m, v_mps, vehicle, kind, _, way in vehicles:
+            is_commanded = self.share >= 1.0 or is_automated(self.seed, vehicle, self.share)
+            edges = tuple(self.replica.edges(way))
+            if edges not in self.routes:
+                self.routes[edges] = f"r{len(self.routes)}"
+                libsumo.route.add(self.routes[edges], edges)
+            name, vehicles_ = str(vehicle), libsumo.vehicle
+            of = f"{'cav' if is_commanded else 'human'}{kind}"
+            vehicles_.add(name, self.routes[edges], of, departPos=repr(x_m), departSpeed=repr(v_mps))
+            # Here and now, not when SUMO would find it fit.
+            vehicles_.moveTo(name, f"{edges[0]}_0", x_m)
+            vehicles_.setPreviousSpeed(name, v_mps)
+            if is_commanded:
+                vehicles_.setSpeedFactor(name, 1.0)
+            self.simulation.see(name)
+            self.simulation.began_s[name] = libsumo.simulation.getTime()
+            self.simulation.totals.departed += 1
+            commanded.append(is_commanded)
+        return commanded
