@@ -210,7 +210,7 @@ impl Membership {
 
     /// Sees to whoever has come.
     pub(super) fn attend(&mut self, driver: &mut Driver, waiter: &mut Waiter) -> Result<(), ProcessError> {
-        let Membership { reception, members, coming, arrived, gone, plugins, .. } = self;
+        let Membership { reception, members, coming, arrived, gone, plugins, events, .. } = self;
         reception.go_on_from(driver.world().step());
         let before = arrived.len();
         let step = driver.world().step();
@@ -220,6 +220,8 @@ impl Membership {
             if driver.seat(role, index, seat) {
                 // Before it is answered, and so before it can send anything.
                 told = members.tell(step, driver.members());
+                // Another may have had the place for a moment, and have died before it could begin.
+                coming.retain(|place| *place != (role, index));
                 coming.push((role, index));
             }
             let Some(handover) = driver.handover(role, index) else { return Readiness::Later };
@@ -232,7 +234,10 @@ impl Membership {
                 trace::note(|| format!("{name} has been replaced, generation {}", seat.generation));
                 arrived.push((peer, seat.generation));
                 if role == Role::Controller && plugins.on_exit(index).is_some() {
-                    plugins.taken(index, seat.generation, seat.stands_in);
+                    if plugins.taken(index, seat.generation, seat.stands_in) {
+                        let text = format!("{name} is gone: another has taken its place");
+                        events.say(step, RunEventKind::Exited, text, 1 << index);
+                    }
                     was_not_there |= !seat.stands_in;
                 }
             }

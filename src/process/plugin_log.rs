@@ -137,12 +137,16 @@ impl PluginLog {
         }
     }
 
-    /// Its place has been taken anew, by one of ours or not.
-    pub fn taken(&mut self, controller: u32, generation: u32, stands_in: bool) {
-        if let Some(row) = self.row(controller) {
-            row.generation = generation;
-            row.driven_by = if stands_in { DrivenBy::Builtin } else { DrivenBy::Plugin };
-        }
+    /// Its place has been taken anew, by one of ours or not. Returns whether nobody had noticed that the process before
+    /// had ended, as happens while nobody is waited for.
+    pub fn taken(&mut self, controller: u32, generation: u32, stands_in: bool) -> bool {
+        let Some(row) = self.row(controller) else { return false };
+        // One of ours that is replaced is no end of the controller's.
+        let is_news = row.driven_by != DrivenBy::Builtin && row.exits < generation;
+        row.exits += u32::from(is_news);
+        row.generation = generation;
+        row.driven_by = if stands_in { DrivenBy::Builtin } else { DrivenBy::Plugin };
+        is_news
     }
 
     /// What it has come to; `missed` says of each controller by its index how many deadlines it has missed.
@@ -163,5 +167,32 @@ impl PluginLog {
             }
         };
         self.rows.iter().zip(self.pool..).map(row).collect()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::scenario::load_embedded;
+
+    #[test]
+    fn each_generation_but_the_first_had_an_exit_before_it_whoever_noticed() {
+        let mut scenario = load_embedded("two-merges", &[], None).unwrap();
+        let paths = vec![(1, 0), (1, 1)];
+        scenario.plugins =
+            vec![Plugin { name: "mine".into(), paths, command: None, on_exit: OnExit::Restart }];
+        let mut log = PluginLog::new(&scenario, 1);
+        let row = |log: &PluginLog| log.report(|_| 0).remove(0);
+        log.exited(1);
+        assert!(!log.taken(1, 1, false), "that was noticed");
+        assert!(log.taken(1, 2, false), "nobody was waited for when it ended");
+        log.exited(1);
+        let now = row(&log);
+        assert_eq!((now.exits, now.generation, now.driven_by), (3, 2, DrivenBy::Plugin));
+        assert!(!log.taken(1, 3, true) && !log.taken(1, 4, true), "one of ours was replaced");
+        assert_eq!((row(&log).exits, row(&log).driven_by), (3, DrivenBy::Builtin));
+        // The pool's are none of them.
+        assert!(!log.taken(0, 7, false) && log.on_exit(0).is_none());
     }
 }

@@ -94,7 +94,8 @@ fn killed(choice: &str, seed: u64) -> String {
     let is_as_chosen = match (choice, exits) {
         // It was killed before the run began, or when that was over.
         (_, 0) => replaced == 0,
-        ("restart", _) => driven_by == "plugin" && replaced == exits,
+        // One that died before it could begin has had a generation, and replaced nobody.
+        ("restart", _) => driven_by == "plugin" && generation == exits && (1..=exits).contains(&replaced),
         ("builtin", _) => driven_by == "builtin" && replaced == exits,
         ("shield-fallback", _) => driven_by == "shield-fallback" && replaced == 0,
         _ => false,
