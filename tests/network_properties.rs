@@ -170,6 +170,8 @@ fn network(raw: &[RawZone]) -> Network {
                     demand: Demand::Poisson(zone.demands[at].clone()),
                     routes: Vec::new(),
                     entry: EntryRule::default(),
+                    automated: None,
+                    rank: 0,
                 });
                 Source::Road(road)
             });
@@ -216,7 +218,7 @@ fn scenario() -> impl Strategy<Value = Scenario> {
             max_time_s: END_S,
             network: network(&raw),
             vehicle: VEHICLE,
-            fleet: vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: VEHICLE }],
+            fleet: vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: VEHICLE, human: None }],
             control,
             coordination: CoordinationParams { schedule, ..CoordinationParams::DEFAULT },
             beta: 2.0 / 3.0,

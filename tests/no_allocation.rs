@@ -63,7 +63,11 @@ impl Judge {
 
 #[test]
 fn steady_steps_in_one_process_allocate_nothing() {
-    let mut run = InProcess::new(&scenario(), 1, 1);
+    in_one_process(&scenario());
+}
+
+fn in_one_process(scenario: &Arc<Scenario>) {
+    let mut run = InProcess::new(scenario, 1, 1);
     let (mut judge, mut more) = (Judge::new(0), true);
     while more {
         let step = run.world().step();

@@ -15,7 +15,7 @@ use std::sync::Mutex;
 ///
 /// When they differ from what a run gives, something that decides where vehicles drive has changed: the
 /// law, the coordinators, the world, the arrivals, the layout of the state record, or an embedded scenario.
-const GOLDEN: [(&str, [&str; 3]); 9] = [
+const GOLDEN: [(&str, [&str; 3]); 10] = [
     ("two-merges", ["6062d4276bac3bb5", "8537653cd0596222", "060e0376e9ea30a3"]),
     ("paper", ["b56ea7e351b4a6a2", "204eba1f547116eb", "58b2783c8587e258"]),
     ("varying-demand", ["67d94661f45bbf64", "58778c46844a111e", "640ffabf3c9e3402"]),
@@ -24,6 +24,7 @@ const GOLDEN: [(&str, [&str; 3]); 9] = [
     ("intersection", ["4709c787e0bd4a2d", "b5b69ad2ee3a2846", "21678e1dce4c481c"]),
     ("roundabout", ["7c559057265e8f02", "f5a3348062abef64", "35591a6ddc9f9f95"]),
     ("lane-drop", ["b89e99c310d7b39e", "8ea8d167aff4ca13", "5c231e5a351141b5"]),
+    ("mixed-merges", ["e03fa2340ce9bcab", "830869906d59f8ad", "2b20bbe7de43f577"]),
     ("grid-3x3", ["ec4453ac054ac217", "1db962770d04438f", "d3d0594cbbad19dd"]),
 ];
 
@@ -140,6 +141,12 @@ fn varying_demand() {
 #[test]
 fn corridor_8() {
     check("corridor-8");
+}
+
+/// Human drivers among automated vehicles.
+#[test]
+fn mixed_merges() {
+    check("mixed-merges");
 }
 
 #[test]

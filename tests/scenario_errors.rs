@@ -746,7 +746,7 @@ fn missing_scenarios_and_seeds() {
     assert_eq!(
         error(load(Some("two-merge"), &[], None)),
         "two-merge: no such scenario; expected one of two-merges, paper, varying-demand, corridor-8, tree, \
-         faulty-sensors, intersection, roundabout, lane-drop, grid-3x3, or the path of a TOML file; did you mean two-merges?"
+         faulty-sensors, intersection, roundabout, lane-drop, grid-3x3, mixed-merges, or the path of a TOML file; did you mean two-merges?"
     );
     for path in ["nowhere/two-merges", "nowhere.toml"] {
         let message = error(load(Some(path), &[], None));

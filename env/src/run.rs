@@ -191,7 +191,11 @@ impl Run {
         }
         for (&(from, count), actions) in self.places.iter().zip(actions.chunks(self.capacity)) {
             for (command, &action) in self.commands[from..from + count].iter_mut().zip(actions) {
-                let limits = &scenario.fleet[usize::from(scenario.kind_of(command.vehicle))].vehicle;
+                let kind = match scenario.fleet.len() {
+                    1 => 0,
+                    _ => self.states.0.iter().find(|s| s.vehicle == command.vehicle).map_or(0, |s| s.kind),
+                };
+                let limits = &scenario.fleet[usize::from(kind)].vehicle;
                 if action != command.u_mps2 {
                     let u_mps2 = action.clamp(limits.u_min_mps2, limits.u_max_mps2);
                     let VehicleCommand { vehicle, zone, .. } = *command;

@@ -61,9 +61,11 @@
 /** `cz_vehicle_state_t.flags`: somebody left the zone during the step just ended (an event of the
  *  zone); set in all its records that have `CZ_STATE_LEFT`. */
 #define CZ_STATE_LEFT_NOW UINT16_C(4)
-/** `cz_vehicle_state_t.flags`: driven by a human. Not to be commanded. Reserved: no world sends it
- *  yet. */
+/** `cz_vehicle_state_t.flags`: driven by a human. Not to be commanded, and without a plan. */
 #define CZ_STATE_HUMAN UINT16_C(8)
+/** `cz_vehicle_state_t.flags`: a human who does not follow the passing order passed a conflict
+ *  point during the step just ended (an event of the zone). */
+#define CZ_STATE_PASSED UINT16_C(16)
 
 /** `cz_assignment_t.kind`: no partner; the record only carries the terminal speed. */
 #define CZ_CONSTRAINT_NONE UINT16_C(0)
@@ -305,7 +307,7 @@ typedef struct cz_vehicle_state {
     /** Kind of vehicle: index in the scenario's fleet. */
     uint16_t kind;
     /** Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3 human
-     *  driver. */
+     *  driver, bit 4 a human passed a conflict point. */
     uint16_t flags;
 } cz_vehicle_state_t;
 CZ_ASSERT_(vehicle_state_size, sizeof(cz_vehicle_state_t) == 96);

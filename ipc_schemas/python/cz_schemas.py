@@ -47,8 +47,11 @@ STATE_LEFT = 2
 #: `VehicleState.flags`: somebody left the zone during the step just ended (an event of the zone);
 #: set in all its records that have `STATE_LEFT`.
 STATE_LEFT_NOW = 4
-#: `VehicleState.flags`: driven by a human. Not to be commanded. Reserved: no world sends it yet.
+#: `VehicleState.flags`: driven by a human. Not to be commanded, and without a plan.
 STATE_HUMAN = 8
+#: `VehicleState.flags`: a human who does not follow the passing order passed a conflict point
+#: during the step just ended (an event of the zone).
+STATE_PASSED = 16
 
 #: `Assignment.kind`: no partner; the record only carries the terminal speed.
 CONSTRAINT_NONE = 0
@@ -270,7 +273,7 @@ class VehicleState(ctypes.Structure):
             begin at.
         kind: Kind of vehicle: index in the scenario's fleet.
         flags: Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3
-            human driver.
+            human driver, bit 4 a human passed a conflict point.
     """
 
     _fields_ = [

@@ -22,8 +22,11 @@ codes! {
     /// [`VehicleState::flags`]: somebody left the zone during the step just ended (an event of the zone); set in all
     /// its records that have `STATE_LEFT`.
     pub const STATE_LEFT_NOW: u16 = 4;
-    /// [`VehicleState::flags`]: driven by a human. Not to be commanded. Reserved: no world sends it yet.
+    /// [`VehicleState::flags`]: driven by a human. Not to be commanded, and without a plan.
     pub const STATE_HUMAN: u16 = 8;
+    /// [`VehicleState::flags`]: a human who does not follow the passing order passed a conflict point during the step just
+    /// ended (an event of the zone).
+    pub const STATE_PASSED: u16 = 16;
 }
 
 record! {
@@ -70,7 +73,8 @@ record! {
         pub link: u32,
         /// Kind of vehicle: index in the scenario's fleet.
         pub kind: u16,
-        /// Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3 human driver.
+        /// Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3 human driver, bit 4 a human
+        /// passed a conflict point.
         pub flags: u16,
     }
 }

@@ -88,6 +88,8 @@ pub fn side_by_side(family: Family, vehicles: usize, until_s: f64) -> Result<Sce
                 segment: road.segment,
                 routes: Vec::new(),
                 entry: road.entry,
+                automated: road.automated,
+                rank: road.rank,
                 demand: Demand::Poisson(Poisson {
                     rates: vec![RatePeriod { until_s, vehicles_per_hour }],
                     min_headway_s: 2.0,

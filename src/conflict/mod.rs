@@ -5,6 +5,8 @@
 
 mod duties;
 mod geometry;
+mod yielding;
 
 pub use duties::{Duties, Duty, DutyKind, Row};
 pub use geometry::{Conflicts, Point, PointKind, Run, Use};
+pub use yielding::{can_yield, has_gone_first, line_before_m};

@@ -350,7 +350,7 @@ impl Scene<'_> {
     #[inline(always)]
     fn each(&mut self, mut with: impl FnMut(&VehicleState, &Situation, Partners<'_>, &mut Member)) {
         for (at, (state, member)) in self.present.iter().zip(&mut *self.members).enumerate() {
-            if is_anothers(self.others, state) {
+            if is_anothers(self.others, state) || !state.is_commanded() {
                 continue;
             }
             let situation = Situation {

@@ -6,9 +6,9 @@
 
 use super::assign::{Assigner, row};
 use super::schedule::{Scene, Scheduler};
-use crate::conflict::{Conflicts, Duties, Row};
-use crate::scenario::{PassingOrder, Scenario};
-use crate::shield::{Shield, yielding_slack_m};
+use crate::conflict::{Conflicts, Duties, Row, can_yield, has_gone_first};
+use crate::scenario::{PassingOrder, Scenario, VehicleKind};
+use crate::shield::{RESERVE_M, Shield, yielding_slack_m};
 use ipc_schemas::{STATE_ENTERED, VehicleState};
 
 /// A vehicle that lets a newcomer pass first keeps at least this much slack, m: it is not to brake hard for it.
@@ -55,6 +55,9 @@ pub(super) struct Means<'a> {
 pub(super) struct Orders {
     /// By kind of vehicle.
     shields: Vec<Shield>,
+    fleet: Vec<VehicleKind>,
+    has_humans: bool,
+    longest_m: f64,
     duties: Duties,
     /// An order that is tried.
     tried: Vec<u32>,
@@ -67,6 +70,9 @@ impl Orders {
         let shields = scenario.fleet.iter().map(|kind| Shield::new(&kind.vehicle, scenario.dt_s()));
         Orders {
             shields: shields.collect(),
+            fleet: scenario.fleet.clone(),
+            has_humans: scenario.has_humans(),
+            longest_m: scenario.fleet.iter().map(|kind| kind.vehicle.length_m).fold(0.0, f64::max),
             duties: Duties::default(),
             tried: Vec::new(),
             places: Vec::new(),
@@ -83,7 +89,7 @@ impl Orders {
     ) {
         let Scene { scenario, conflicts, slice, .. } = *scene;
         let members = &slice[slice.iter().take_while(|state| state.has_left()).count()..];
-        if policy == PassingOrder::Fifo {
+        if policy == PassingOrder::Fifo && !self.has_humans {
             order.vehicles.clear();
             order.vehicles.extend(members.iter().map(|state| state.vehicle));
             return;
@@ -97,13 +103,72 @@ impl Orders {
             if order.vehicles.contains(&state.vehicle) {
                 continue;
             }
-            if policy == PassingOrder::Resequenced {
-                self.insert_where_cheapest(scene, members, order, state, means);
-            } else {
-                let place = self.place(scenario, conflicts, members, &order.vehicles, state);
-                order.vehicles.insert(place, state.vehicle);
+            match policy {
+                PassingOrder::Fifo => order.vehicles.push(state.vehicle),
+                PassingOrder::PerPoint => {
+                    let place = self.place(scenario, conflicts, members, &order.vehicles, state);
+                    order.vehicles.insert(place, state.vehicle);
+                }
+                PassingOrder::Resequenced => self.insert_where_cheapest(scene, members, order, state, means),
             }
         }
+        if self.has_humans {
+            self.let_humans_first(scene, members, order);
+        }
+    }
+
+    /// Puts humans who cannot be made to wait ahead of those that can: humans who do not follow the order, and newcomers
+    /// who would learn too late that they are to wait.
+    fn let_humans_first(&mut self, scene: &Scene<'_>, members: &[VehicleState], order: &mut Order) {
+        let Scene { scenario, conflicts, .. } = *scene;
+        for state in members {
+            let Some(human) = scenario.human(state.kind) else { continue };
+            let is_newcomer = state.flags & STATE_ENTERED != 0;
+            if human.obeys() && !is_newcomer {
+                continue;
+            }
+            let vehicle = state.vehicle;
+            let own_place =
+                order.vehicles.iter().position(|v| *v == vehicle).expect("members are in the order");
+            let own = row(scenario, state, 1);
+            let before = &order.vehicles[..own_place];
+            let before = || before.iter().rev().filter_map(|v| members.iter().find(|s| s.vehicle == *v));
+            let waits = |other: &VehicleState| {
+                let first = row(scenario, other, 0);
+                let meets = meeting(conflicts, &first, &own) == Meeting::AtPoints;
+                !meets || self.can_yield(conflicts, state.kind, &first, &own)
+            };
+            if human.obeys() && before().all(waits) {
+                continue;
+            }
+            let mut place = own_place;
+            for (at, &other) in order.vehicles[..own_place].iter().enumerate().rev() {
+                let Some(second) = members.iter().find(|s| s.vehicle == other) else { continue };
+                let (first, row) = (row(scenario, state, 0), row(scenario, second, 1));
+                match meeting(conflicts, &first, &row) {
+                    Meeting::Nowhere => continue,
+                    Meeting::OnALane => break,
+                    Meeting::AtPoints => {}
+                }
+                match scenario.human(second.kind) {
+                    Some(other) if !other.obeys() => continue,
+                    _ if self.slack_m(conflicts, second.kind, &first, &row) >= RESERVE_M
+                        || has_gone_first(conflicts, &first, &row) =>
+                    {
+                        place = at;
+                    }
+                    _ => break,
+                }
+            }
+            order.vehicles[place..=own_place].rotate_right(1);
+        }
+    }
+
+    /// Whether a human can still let another pass first, if it does as it is told.
+    fn can_yield(&self, conflicts: &Conflicts, kind: u16, first: &Row, second: &Row) -> bool {
+        let kind = &self.fleet[usize::from(kind).min(self.fleet.len() - 1)];
+        let human = kind.human.as_ref().filter(|human| human.obeys());
+        human.is_some_and(|human| can_yield((human, &kind.vehicle), conflicts, first, second, self.longest_m))
     }
 
     /// Puts a newcomer where the schedule of all costs least: at the end of the order, or ahead of up to three others that
@@ -191,8 +256,12 @@ impl Orders {
         }
     }
 
-    /// By how much the second can let the first pass, m.
+    /// By how much the second can let the first pass, m; of a human, without bound or not at all.
     fn slack_m(&mut self, conflicts: &Conflicts, kind: u16, first: &Row, second: &Row) -> f64 {
+        if self.has_humans && self.fleet[usize::from(kind).min(self.fleet.len() - 1)].human.is_some() {
+            let can = self.can_yield(conflicts, kind, first, second);
+            return if can { f64::INFINITY } else { f64::NEG_INFINITY };
+        }
         let shield = &self.shields[usize::from(kind).min(self.shields.len() - 1)];
         yielding_slack_m(shield, conflicts, &mut self.duties, first, second)
     }

@@ -3,7 +3,8 @@
 use super::flow::segment_m;
 use crate::scenario::{Scenario, ScheduleKind, ZoneId};
 use ipc_schemas::{
-    NO_PATH, NO_VEHICLE, STATE_ENTERED, STATE_LEFT, STATE_LEFT_NOW, SUMMARY_COMING, VehicleState, ZoneSummary,
+    NO_PATH, NO_VEHICLE, STATE_ENTERED, STATE_HUMAN, STATE_LEFT, STATE_LEFT_NOW, STATE_PASSED,
+    SUMMARY_COMING, VehicleState, ZoneSummary,
 };
 
 /// Whom a zone tells about itself.
@@ -13,9 +14,14 @@ pub struct Audience {
     /// How far it is from the origin of each path to the zone behind it, m, where that begins at its end: when and how
     /// fast a vehicle comes over a link is not the coordinators' to decide.
     onward_m: Vec<Option<f64>>,
+    /// Lengths of the paths, m.
+    lengths_m: Vec<f64>,
     /// Whether neighbours are told of each vehicle.
     in_detail: bool,
 }
+
+/// Humans are expected to drive no more slowly, m/s.
+const LEAST_EXPECTED_MPS: f64 = 1.0;
 
 #[derive(Clone, Copy, Debug)]
 struct Neighbour {
@@ -43,6 +49,7 @@ impl Audience {
         Audience {
             neighbours: neighbours.collect(),
             onward_m: onward_m.collect(),
+            lengths_m: own.paths.iter().map(|path| path.length_m).collect(),
             in_detail: scenario.coordination.schedule == ScheduleKind::Tandem,
         }
     }
@@ -70,11 +77,19 @@ impl Audience {
         state: &VehicleState,
         all: ZoneSummary,
     ) -> impl Iterator<Item = ZoneSummary> + use<> {
+        // A human tells nobody what it plans: it is expected to drive as fast as it came.
+        let (planned_exit_time_s, planned_exit_speed_mps) = if state.flags & STATE_HUMAN != 0 {
+            let length_m = self.lengths_m[state.path as usize];
+            let v_mps = state.entry_speed_mps.max(LEAST_EXPECTED_MPS);
+            (state.entry_time_s + length_m / v_mps, v_mps)
+        } else {
+            (state.planned_exit_time_s, state.planned_exit_speed_mps)
+        };
         let told = ZoneSummary {
             x_m: state.x_m,
             v_mps: state.v_mps,
-            planned_exit_time_s: state.planned_exit_time_s,
-            planned_exit_speed_mps: state.planned_exit_speed_mps,
+            planned_exit_time_s,
+            planned_exit_speed_mps,
             vehicle: state.vehicle,
             path: state.path,
             next_path: state.next_path,
@@ -93,9 +108,10 @@ impl Audience {
     }
 }
 
-/// Whether a vehicle entered or left the zone of this S(t) in the step just ended.
+/// Whether a vehicle entered or left the zone of this S(t) in the step just ended, or a human who does not follow the
+/// order passed a conflict point.
 pub fn is_event(slice: &[VehicleState]) -> bool {
-    slice.iter().any(|s| s.flags & (STATE_ENTERED | STATE_LEFT_NOW) != 0)
+    slice.iter().any(|s| s.flags & (STATE_ENTERED | STATE_LEFT_NOW | STATE_PASSED) != 0)
 }
 
 fn summarise(zone: ZoneId, neighbour: &Neighbour, slice: &[VehicleState]) -> ZoneSummary {

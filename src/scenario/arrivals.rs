@@ -120,7 +120,16 @@ mod tests {
             .collect();
         let speed = SpeedDistribution { mean_mps: 16.0, sd_mps: 1.2, min_mps: 14.0, max_mps: 17.5 };
         let demand = Demand::Poisson(Poisson { rates, min_headway_s, speed });
-        Road { name: "r".into(), zone: 0, segment: 0, demand, routes: Vec::new(), entry: EntryRule::Free }
+        Road {
+            name: "r".into(),
+            zone: 0,
+            segment: 0,
+            demand,
+            routes: Vec::new(),
+            entry: EntryRule::Free,
+            automated: None,
+            rank: 0,
+        }
     }
 
     fn arrivals(road: &Road, index: u32, seed: u64) -> Vec<Arrival> {

@@ -8,8 +8,8 @@ use super::keys;
 use super::network::entrance_without_way_out;
 use super::ranges::{self, MAX_COUNT, MAX_DELAY, MAX_ERROR, MAX_KINDS, MAX_RATE_PER_HOUR, MAX_TIME_S};
 use super::{
-    Demand, Faults, Network, Path, Poisson, Scenario, Scope, SensorKind, Source, Span, VehicleParams, Zone,
-    flow,
+    Demand, Faults, HumanParams, Network, Path, Poisson, Road, Scenario, Scope, SensorKind, Source, Span,
+    VehicleParams, Zone, flow,
 };
 
 impl Scenario {
@@ -28,6 +28,7 @@ impl Scenario {
             within(&keys::SHARE, kind.share)?;
             // Steps and paths are sized for the fastest.
             number("v_max_mps", kind.vehicle.v_max_mps, |v| v <= self.vehicle.v_max_mps)?;
+            kind.human.as_ref().map_or(Ok(()), |driver| human(driver, &kind.vehicle))?;
         }
         let control = &self.control;
         for (key, value) in [
@@ -58,6 +59,7 @@ impl Scenario {
             flow::check(exit, &self.network, self.vehicle.v_max_mps)?;
         }
         for road in &self.network.roads {
+            self.check_mixture(road)?;
             demand(&road.demand, &self.vehicle, road.routes.len())
                 .map_err(|fault| ScenarioFault::of(format!("road {}: {fault}", road.name)))?;
         }
@@ -96,6 +98,14 @@ impl Scenario {
             span(&stall.span)?;
         }
         Ok(())
+    }
+
+    fn check_mixture(&self, road: &Road) -> Check {
+        require(road.rank <= 1000, || format!("rank = {}", road.rank))?;
+        let Some(share) = road.automated else { return Ok(()) };
+        within(&keys::AUTOMATED, share)?;
+        let has = |human: bool| self.fleet.iter().any(|k| k.human.is_some() == human && k.share > 0.0);
+        require((share == 1.0 || has(true)) && (share == 0.0 || has(false)), || "automated".to_owned())
     }
 
     fn check_scope(&self, scope: &Scope) -> Check {
@@ -140,6 +150,26 @@ fn vehicle(v: &VehicleParams) -> Check {
     within(&keys::LENGTH, v.length_m)?;
     within(&keys::REACTION_TIME, v.reaction_time_s)?;
     within(&keys::STANDSTILL_GAP, v.standstill_gap_m)
+}
+
+fn human(h: &HumanParams, v: &VehicleParams) -> Check {
+    number("desired_mps", h.desired_mps, |s| keys::DESIRED.range.contains(s) && s <= v.v_max_mps)?;
+    for (key, value) in [
+        (&keys::DESIRED_SD, h.desired_sd_mps),
+        (&keys::TIME_HEADWAY, h.headway_s),
+        (&keys::JAM_GAP, h.jam_gap_m),
+        (&keys::IDM_ACCELERATION, h.acceleration_mps2),
+        (&keys::COMFORTABLE, h.comfortable_mps2),
+        (&keys::DELAY, h.delay_s),
+        (&keys::NOISE, h.noise_mps2),
+        (&keys::CRITICAL_GAP, h.critical_gap_s),
+        (&keys::PATIENCE, h.patience_s),
+        (&keys::HARDEST, h.hardest_mps2),
+        (&keys::SCARES, h.scares_per_h),
+    ] {
+        within(key, value)?;
+    }
+    Ok(())
 }
 
 /// Indices point at something, both ends of a connection know of each other, and every zone has a way out.

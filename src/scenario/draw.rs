@@ -4,6 +4,8 @@ use xxhash_rust::xxh3::xxh3_64;
 
 /// Purpose of the draw of a vehicle's kind.
 pub(crate) const KIND: u64 = u64::MAX;
+/// Purpose of the draw of who drives a vehicle.
+pub(crate) const DRIVER: u64 = u64::MAX - 2;
 /// Purpose of the draw of a vehicle's route.
 pub(crate) const ROUTE: u64 = u64::MAX - 1;
 

@@ -1,7 +1,7 @@
 //! Scenarios and arrival traces that are part of the program, so that it runs from any directory.
 
 /// Name and text, the default first.
-pub(super) const SCENARIOS: [(&str, &str); 10] = [
+pub(super) const SCENARIOS: [(&str, &str); 11] = [
     ("two-merges", include_str!("../../scenarios/two-merges.toml")),
     ("paper", include_str!("../../scenarios/paper.toml")),
     ("varying-demand", include_str!("../../scenarios/varying-demand.toml")),
@@ -12,6 +12,7 @@ pub(super) const SCENARIOS: [(&str, &str); 10] = [
     ("roundabout", include_str!("../../scenarios/roundabout.toml")),
     ("lane-drop", include_str!("../../scenarios/lane-drop.toml")),
     ("grid-3x3", include_str!("../../scenarios/grid-3x3.toml")),
+    ("mixed-merges", include_str!("../../scenarios/mixed-merges.toml")),
 ];
 
 macro_rules! traces {

@@ -12,7 +12,7 @@ pub(in crate::scenario) use kinds::{Choice, Flag, Key, Number, other};
 use super::ranges;
 use super::{
     EntryRule, FeConditions, LawKind, PassingOrder, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
-    ScheduleKind, ShieldMode, Solver, ViableParams,
+    ScheduleKind, ShieldMode, Solver, ViableParams, Yielding,
 };
 use kinds::{number, without_default};
 
@@ -95,7 +95,79 @@ pub(in crate::scenario) static FLEET: Keys = &[
     &LENGTH,
     &REACTION_TIME,
     &STANDSTILL_GAP,
+    &DRIVER,
+    &YIELDS,
+    &DESIRED,
+    &DESIRED_SD,
+    &TIME_HEADWAY,
+    &JAM_GAP,
+    &IDM_ACCELERATION,
+    &COMFORTABLE,
+    &DELAY,
+    &NOISE,
+    &CRITICAL_GAP,
+    &PATIENCE,
+    &HARDEST,
+    &SCARES,
 ];
+
+// Human drivers.
+pub(in crate::scenario) static DRIVER: Choice<bool> = Choice {
+    name: "driver",
+    words: &[("automated", false), ("human", true)],
+    meaning: "who drives: controllers, or a human ([mixed traffic](mixed.md)); the limits of a human's vehicle are what \
+              others reckon with. What follows is for humans alone",
+};
+pub(in crate::scenario) static YIELDS: Choice<Yielding> = Choice {
+    name: "yields",
+    words: Yielding::WORDS,
+    meaning: "who goes first at conflict points: as the coordinator says, by the roads' `rank`, or who comes first; with the \
+              latter two where no gap is accepted",
+};
+pub(in crate::scenario) static DESIRED: Number = without_default(
+    "desired_mps",
+    ranges::HUMAN_SPEED,
+    "`v_max_mps`",
+    "mean desired speed, at most `v_max_mps`",
+);
+pub(in crate::scenario) static DESIRED_SD: Number =
+    number("desired_sd_mps", ranges::DEVIATION, 0.0, "its standard deviation over drivers, m/s");
+pub(in crate::scenario) static TIME_HEADWAY: Number =
+    number("headway_s", ranges::HUMAN_TIME, 1.2, "time headway T of the intelligent driver model");
+pub(in crate::scenario) static JAM_GAP: Number =
+    number("jam_gap_m", ranges::STANDSTILL_GAP, 2.0, "distance between bodies at a standstill, s0");
+pub(in crate::scenario) static IDM_ACCELERATION: Number =
+    number("acceleration_mps2", ranges::HUMAN_ACCELERATION, 1.5, "greatest acceleration, a");
+pub(in crate::scenario) static COMFORTABLE: Number =
+    number("comfortable_mps2", ranges::HUMAN_ACCELERATION, 2.0, "comfortable deceleration, b");
+pub(in crate::scenario) static DELAY: Number =
+    number("delay_s", ranges::HUMAN_DELAY, 0.6, "delay with which they notice what others do");
+pub(in crate::scenario) static NOISE: Number = number(
+    "noise_mps2",
+    ranges::DEVIATION,
+    0.1,
+    "deviation of the acceleration, drawn anew every second, m/s^2",
+);
+pub(in crate::scenario) static CRITICAL_GAP: Number = number(
+    "critical_gap_s",
+    ranges::HUMAN_TIME,
+    2.0,
+    "least time from their clearing a conflict point to the arrival of one that has the right of way",
+);
+pub(in crate::scenario) static PATIENCE: Number = number(
+    "patience_s",
+    ranges::HUMAN_TIME,
+    10.0,
+    "standing longer than this they go before whoever can stop without haste",
+);
+pub(in crate::scenario) static HARDEST: Number = without_default(
+    "hardest_mps2",
+    ranges::HUMAN_ACCELERATION,
+    "that of `u_min_mps2`",
+    "how hard they brake at most, as a positive number",
+);
+pub(in crate::scenario) static SCARES: Number =
+    number("scares_per_h", ranges::RATE, 0.0, "how often they brake as hard as that for 2 s for no reason");
 
 // [objective]
 pub(in crate::scenario) static BETA: Number =
@@ -273,11 +345,24 @@ pub(in crate::scenario) static CONTROL: Keys = &[
 ];
 
 // [[roads]]
+pub(in crate::scenario) static AUTOMATED: Number = without_default(
+    "automated",
+    ranges::PART,
+    "as the kinds' shares say",
+    "share of its vehicles that are of the kinds without human drivers",
+);
 pub(in crate::scenario) static ROADS: Keys = &[
     &other("name", "text", "required", "unique among the roads; arrival traces use it"),
     &other("demand", "table", "required", "who arrives when: a trace, or random arrivals"),
     &other("routes", "list", "paths are drawn", "ways its vehicles may take"),
     &other("entry", "as `entry` of `[gate]`", "that of `[gate]`", "when its vehicles may enter"),
+    &AUTOMATED,
+    &other(
+        "rank",
+        "integer from 0 to 1000",
+        "0",
+        "humans give way to those of higher rank ([mixed traffic](mixed.md))",
+    ),
 ];
 pub(in crate::scenario) static ROUTES: Keys = &[
     &other("name", "text", "required", "unique among the road's; a trace's column `route` uses it"),

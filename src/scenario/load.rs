@@ -202,7 +202,8 @@ fn read(document: &Document, base: TraceBase) -> Result<Scenario, ScenarioError>
         let name = reader.roads[index].to_owned();
         let routes = std::mem::take(&mut reader.routes[index]);
         let entry = sections::entry(Some(table), entry_everywhere)?;
-        roads.push(Road { name, zone, segment, demand, routes, entry });
+        let (automated, rank) = sections::mixture(table, &fleet)?;
+        roads.push(Road { name, zone, segment, demand, routes, entry, automated, rank });
     }
     let plugins = plugins::read(&root, &topology.zones)?;
     let shield = root.chosen(&keys::SHIELD)?;

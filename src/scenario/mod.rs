@@ -14,6 +14,7 @@ pub mod encode;
 mod fault;
 pub mod faults;
 pub mod flow;
+mod human;
 mod keys;
 pub mod layout;
 pub mod load;
@@ -31,6 +32,7 @@ pub use encode::{DecodeError, decode, encode, keep, kept, scenario_hash};
 pub use fault::ScenarioFault;
 pub use faults::{CommandFaults, Faults, Noise, Scope, SensorFault, SensorKind, Span, Stall};
 pub use flow::{Baseline, FlowPolicy, Observed};
+pub use human::{HumanParams, Yielding};
 pub use keys::document as keys_document;
 pub use load::{
     DEFAULT_SCENARIO, Override, ScenarioError, embedded_names, load, load_embedded, load_file, load_given,
@@ -84,12 +86,34 @@ pub struct Scenario {
 
 impl Scenario {
     /// The kind of a vehicle: index in [`fleet`](Self::fleet). A hash of seed and vehicle, so nothing is remembered.
-    pub fn kind_of(&self, vehicle: u32) -> u16 {
+    /// On a road with a share of automated vehicles, that decides first whether a human drives.
+    pub fn kind_of(&self, vehicle: u32, road: u32) -> u16 {
         if self.fleet.len() == 1 {
             return 0;
         }
-        draw::choice(self.seed, u64::from(vehicle), draw::KIND, self.fleet.iter().map(|kind| kind.share))
-            as u16
+        let choice = |purpose, weights: &mut dyn Iterator<Item = f64>| {
+            let weights: [f64; ranges::MAX_KINDS] = std::array::from_fn(|_| weights.next().unwrap_or(0.0));
+            draw::choice(self.seed, u64::from(vehicle), purpose, weights.iter().copied())
+        };
+        let is_human = self
+            .network
+            .roads
+            .get(road as usize)
+            .and_then(|road| road.automated)
+            .map(|share| choice(draw::DRIVER, &mut [share, 1.0 - share].into_iter()) == 1);
+        let of_class = |kind: &VehicleKind| is_human.is_none_or(|human| human == kind.human.is_some());
+        let share = |kind: &VehicleKind| if of_class(kind) { kind.share } else { 0.0 };
+        choice(draw::KIND, &mut self.fleet.iter().map(share)) as u16
+    }
+
+    /// Whether any vehicle may be driven by a human.
+    pub fn has_humans(&self) -> bool {
+        self.fleet.iter().any(|kind| kind.human.is_some())
+    }
+
+    /// The driver of a kind of vehicle, if it is a human.
+    pub fn human(&self, kind: u16) -> Option<&HumanParams> {
+        self.fleet.get(usize::from(kind))?.human.as_ref()
     }
 
     /// The step length in seconds.

@@ -187,6 +187,12 @@ pub struct Road {
     pub routes: Vec<Route>,
     /// When they may enter.
     pub entry: EntryRule,
+    /// Share of its vehicles that no human drives; that of the kinds when absent.
+    #[serde(default)]
+    pub automated: Option<f64>,
+    /// Humans give way to those of roads of higher rank; vehicles from another zone have the right of way before all.
+    #[serde(default)]
+    pub rank: u32,
 }
 
 /// The paths a vehicle takes from zone to zone; behind the last one paths are drawn.

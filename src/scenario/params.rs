@@ -1,5 +1,6 @@
 //! Parameters of vehicles, controllers and flow policies.
 
+use super::human::HumanParams;
 use super::keys;
 use serde::{Deserialize, Serialize};
 
@@ -29,8 +30,11 @@ pub struct VehicleKind {
     pub name: String,
     /// Weight with which vehicles are of this kind.
     pub share: f64,
-    /// Limits, length and distances.
+    /// Limits, length and distances. Of a human's vehicle the limits are what others may assume of it.
     pub vehicle: VehicleParams,
+    /// Who drives it: a human, or else whoever is commissioned.
+    #[serde(default)]
+    pub human: Option<HumanParams>,
 }
 
 /// Which necessary condition the reference trajectory satisfies.

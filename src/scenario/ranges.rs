@@ -65,6 +65,20 @@ pub(super) const PRICE_OF_EXPOSURE: Range = Range { zero: true, ..range("a price
 pub(super) const PRICE_OF_TIME: Range = range("a share", 0.0, 100.0, "");
 /// `coordination.tandem_weight`.
 pub(super) const TANDEM_WEIGHT: Range = range("a weight", 0.01, 1.0, "");
+/// Speeds and deviations of human drivers.
+pub(super) const HUMAN_SPEED: Range = range("a speed", 0.1, 1000.0, "m/s");
+/// The same, where none is one.
+pub(super) const DEVIATION: Range = range("a deviation", 0.0, 10.0, "");
+/// Accelerations of human drivers, as positive numbers.
+pub(super) const HUMAN_ACCELERATION: Range = range("an acceleration", 0.1, 100.0, "m/s^2");
+/// Times of human drivers.
+pub(super) const HUMAN_TIME: Range = range("a time", 0.0, 100.0, "s");
+/// `delay_s`: what is seen is remembered that long, step by step.
+pub(super) const HUMAN_DELAY: Range = range("a time", 0.0, 5.0, "s");
+/// `scares_per_h`.
+pub(super) const RATE: Range = range("a rate", 0.0, 1800.0, "1/h");
+/// `automated` of a road.
+pub(super) const PART: Range = range("a share", 0.0, 1.0, "");
 /// `min_headway_s` of random arrivals.
 pub(super) const HEADWAY: Range = range("a time", 0.0, 1e6, "s");
 

@@ -1,5 +1,6 @@
 //! One vehicle's motion, exactly, and what it means to be safe beside another.
 
+pub mod driver;
 mod held;
 mod safety;
 

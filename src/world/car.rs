@@ -73,6 +73,8 @@ pub(super) struct Visit {
     pub verdict: u16,
     /// Entered during the step just ended.
     pub entered: bool,
+    /// Driven by a human who does not follow the passing order, and passed a conflict point in it.
+    pub passes: bool,
     pub infeasible: bool,
     /// Whether the command in force was no number or beyond the limits as it came.
     pub beyond: bool,
@@ -92,6 +94,7 @@ impl Visit {
         least_merge_m: f64::INFINITY,
         least_cross_m: f64::INFINITY,
         entered: true,
+        passes: false,
         verdict: VERDICT_NOMINAL,
         infeasible: false,
         beyond: false,

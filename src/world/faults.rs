@@ -184,9 +184,10 @@ impl Faults {
         limits: Limits,
         cars: &mut Lists<Car>,
         first: impl Fn(usize) -> usize,
+        is_commanded: impl Fn(&Car) -> bool,
     ) {
         for zone in 0..self.zones {
-            for car in &mut cars[zone][first(zone)..] {
+            for car in cars[zone][first(zone)..].iter_mut().filter(|car| is_commanded(car)) {
                 let fate = self.fate(step, time_s, zone as ZoneId, car);
                 self.counts.commands_lost += u64::from(fate == Fate::Lost);
                 self.counts.commands_delayed += u64::from(fate == Fate::Late);
@@ -278,7 +279,7 @@ fn as_said((truth, said): (VehicleState, &Sample)) -> VehicleState {
 
 /// What a draw is for: draws of different purposes are independent.
 #[derive(Clone, Copy, Debug)]
-enum Purpose {
+pub(super) enum Purpose {
     Position,
     Speed,
     Loss,
@@ -287,6 +288,12 @@ enum Purpose {
     Sensor(u32),
     /// The same for a stall.
     Stall(u32),
+    /// What a human driver's desired speed differs from the mean.
+    Desired,
+    /// Error of a human driver's acceleration.
+    Wavering,
+    /// Whether a human driver brakes for no reason.
+    Scare,
 }
 
 impl Purpose {
@@ -298,17 +305,24 @@ impl Purpose {
             Purpose::Delay => (4, 0),
             Purpose::Sensor(index) => (5, index),
             Purpose::Stall(index) => (6, index),
+            Purpose::Desired => (7, 0),
+            Purpose::Wavering => (8, 0),
+            Purpose::Scare => (9, 0),
         }
     }
 }
 
 /// The run's random numbers, each a function of what it is for.
 #[derive(Clone, Copy, Debug)]
-struct Draws {
+pub(super) struct Draws {
     seed: u64,
 }
 
 impl Draws {
+    pub(super) fn of(seed: u64) -> Draws {
+        Draws { seed }
+    }
+
     /// 64 random bits, the `word`th of a draw.
     fn bits(self, step: u64, vehicle: u32, purpose: Purpose, word: u32) -> u64 {
         let (kind, index) = purpose.code();
@@ -322,14 +336,14 @@ impl Draws {
     }
 
     /// Uniform in [0, 1).
-    fn uniform(self, step: u64, vehicle: u32, purpose: Purpose) -> f64 {
+    pub(super) fn uniform(self, step: u64, vehicle: u32, purpose: Purpose) -> f64 {
         const STEP: f64 = 1.0 / (1u64 << 53) as f64;
         (self.bits(step, vehicle, purpose, 0) >> 11) as f64 * STEP
     }
 
     /// Nearly normal with mean 0 and variance 1, within 6 of 0: the sum of twelve uniform numbers of 16 bits
     /// each, less its mean. Exact, where a logarithm or a cosine would depend on the machine.
-    fn normal(self, step: u64, vehicle: u32, purpose: Purpose) -> f64 {
+    pub(super) fn normal(self, step: u64, vehicle: u32, purpose: Purpose) -> f64 {
         let words = (0..3).map(|word| self.bits(step, vehicle, purpose, word));
         let sum: u64 = words.map(|w| (0..4).map(|i| w >> (16 * i) & 0xffff).sum::<u64>()).sum();
         // Each stands for the middle of its interval of 2^-16.

@@ -170,7 +170,7 @@ impl Gateway {
             shields: scenario.fleet.iter().map(|kind| Shield::new(&kind.vehicle, scenario.dt_s())).collect(),
             rows: names.map(ShieldRow::new).collect(),
             drivers,
-            partners: Vec::with_capacity(2),
+            partners: Vec::with_capacity(16),
             falls_back: false,
         }
     }
@@ -231,7 +231,7 @@ impl World {
         commands: &[VehicleCommand],
         greatest_verdict: u16,
     ) -> Result<(), CommandFault> {
-        let kinds = &self.kinds;
+        let (kinds, humans) = (&self.kinds, self.humans.as_deref());
         let Gateway { mode, drivers, rows, falls_back, .. } = &mut self.gateway;
         let (mut beyond, mut not_finite) = (0, 0);
         let mut next = 0;
@@ -246,6 +246,9 @@ impl World {
             let first = self.zones[zone as usize].first();
             for car in &mut self.cars[zone as usize][first..] {
                 if shared && drivers.of(zone, car.path) != sender {
+                    continue;
+                }
+                if humans.is_some_and(|humans| humans.drive(car.kind)) {
                     continue;
                 }
                 let record = next;
@@ -334,7 +337,7 @@ impl World {
             .zones(controller)
             .flat_map(|zone| self.members(zone as usize).iter().map(move |car| (zone, car)));
         members
-            .filter(|(zone, car)| drivers.of(*zone, car.path) == controller)
+            .filter(|(zone, car)| drivers.of(*zone, car.path) == controller && !self.is_human(car.kind))
             .map(|(zone, car)| {
                 let memory = memories.get(&(zone, car.vehicle)).map_or_else(VehicleCommand::default, |c| **c);
                 let limits = &self.kinds[usize::from(car.kind)];
@@ -403,7 +406,10 @@ impl World {
         if let Some(faults) = self.faults.as_mut().filter(|faults| faults.has_channels()) {
             let time_s = scenario.time_s(self.step);
             let zones = &self.zones;
-            faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, |z| zones[z].first());
+            let humans = self.humans.as_deref();
+            let is_commanded = |car: &Car| !humans.is_some_and(|humans| humans.drive(car.kind));
+            let first = |z: usize| zones[z].first();
+            faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, first, is_commanded);
         }
         let shields = self.gateway.mode != ShieldMode::Off || self.gateway.falls_back;
         if self.played.is_some() {
@@ -493,8 +499,13 @@ impl World {
         let Gateway { mode, shields, drivers, rows, partners, .. } = &mut self.gateway;
         let cars = &mut self.cars[zone];
         let owed = &mut self.owed[zone];
+        let humans = self.humans.as_deref();
+        let is_human = |kind: u16| humans.is_some_and(|humans| humans.drive(kind));
         for &at in &self.order[zone] {
             let car = cars[at as usize];
+            if is_human(car.kind) {
+                continue;
+            }
             let falls_back = car.visit.verdict == frames::VERDICT_FALLBACK;
             if (*mode == ShieldMode::Off && !falls_back) || !car.is_commanded {
                 continue;
@@ -504,10 +515,13 @@ impl World {
             partners.clear();
             for (at, owed) in owed[car.owed.0 as usize..car.owed.1 as usize].iter_mut().enumerate() {
                 let other = &cars[owed.duty.partner as usize];
-                let Some(partner) = owed.partner(&car, other, &self.kinds) else { continue };
+                let Some(partner) = owed.partner(&car, other, &self.kinds, is_human(other.kind)) else {
+                    continue;
+                };
                 // Judged when the vehicle comes to owe this partner something, and held to it from then on.
                 if owed.standing == Standing::Unknown {
-                    row.began_unsafe += u32::from(owed.judge(shield, &car, other, &self.kinds));
+                    row.began_unsafe +=
+                        u32::from(owed.judge(shield, &car, other, &self.kinds, is_human(other.kind)));
                 }
                 partners.push((partner, at));
             }
@@ -555,8 +569,14 @@ impl World {
         let last = self.members(to.zone as usize).iter().rev().find(|c| enters(c.path));
         // In a network that closes a circle the zone there may not be settled yet.
         let is_settled = to.zone as usize > zone;
+        let humans = self.humans.as_deref();
+        let is_human = |kind: u16| humans.is_some_and(|humans| humans.drive(kind));
         let mut leader = last.map(|c| {
-            let u_mps2 = if is_settled { c.command_mps2 } else { self.kinds[usize::from(c.kind)].u_min_mps2 };
+            let u_mps2 = if is_settled && !is_human(c.kind) {
+                c.command_mps2
+            } else {
+                self.kinds[usize::from(c.kind)].u_min_mps2
+            };
             (Held::new(c.x_m + to.link_m, c.v_mps, u_mps2), c.kind)
         });
         let Gateway { mode, shields, .. } = &self.gateway;

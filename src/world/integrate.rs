@@ -36,6 +36,7 @@ impl World {
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
         self.derive_duties(&scenario);
+        self.drive_humans(&scenario);
         // Where vehicles in zones depend on nobody's command but their own, each zone settles what they hold
         // as its turn comes: what is downstream of it has not moved yet.
         let alone =
@@ -66,8 +67,11 @@ impl World {
             let crosses = self.look(zone, dt_s);
             self.observe_overlaps(&scenario, zone, dt_s);
             self.zones[zone].left_now = crosses;
+            let passes = self.humans.is_some() && self.members(zone).iter().any(|car| car.visit.passes);
             if crosses {
                 self.cross(&scenario, zone, now_s, dt_s);
+            }
+            if crosses || passes {
                 self.events.push(zone as ZoneId);
             }
             while let Some(Queue { road, segment, .. }) =
@@ -121,10 +125,12 @@ impl World {
             let after_s = held.passes_m(lengths_m[car.path as usize], dt_s);
             leaves |= after_s.is_some();
             let mut lacks_m = 0.0_f64;
-            for owed in owed {
+            // What humans keep is theirs to judge.
+            let is_human = self.humans.as_ref().is_some_and(|humans| humans.drive(car.kind));
+            for owed in if is_human { &mut [][..] } else { owed } {
                 let other = &cars[owed.duty.partner as usize];
                 if owed.standing == Standing::Unknown {
-                    owed.judge(&self.gateway.shields[usize::from(car.kind)], &car, other, &self.kinds);
+                    owed.judge(&self.gateway.shields[usize::from(car.kind)], &car, other, &self.kinds, false);
                 }
                 let Owed { duty, standing, .. } = &*owed;
                 let Some(kind) = duty.in_force(car.x_m, other.x_m) else { continue };
@@ -208,6 +214,12 @@ impl World {
             let to = shape.exits[exit as usize].to;
             let onward = to.map(|to| (to.zone, car.next_path));
             self.gates.pass(Some((zone as ZoneId, car.path)), onward);
+            if let Some(humans) = &mut self.humans {
+                match to {
+                    Some(_) => humans.pass(car.vehicle, length_m, false),
+                    None => humans.forget(car.vehicle),
+                }
+            }
             let Some(Downstream { zone: down, link_m, .. }) = to else {
                 self.departed += 1;
                 continue;
@@ -277,6 +289,9 @@ impl World {
             next.move_on(held, dt_s);
             next.x_m -= to.link_m;
             next.visit.energy = held.energy(dt_s) - held.energy(after_s);
+            if let Some(humans) = &mut self.humans {
+                humans.pass(next.vehicle, to.link_m, true);
+            }
             self.scratch.entries.push(Entry { zone: to.zone, car: next });
             cars.remove(at);
             self.links.cars -= 1;
@@ -294,7 +309,7 @@ impl World {
             while let Some(&Waiting { arrival, held }) = self.gates.waiting[road as usize].front() {
                 let id = self.arrived;
                 let way = ways.at_road(road, id, arrival.route);
-                let kind = scenario.kind_of(id);
+                let kind = scenario.kind_of(id, road);
                 let own = &self.kinds[usize::from(kind)];
                 let mut speed_mps = arrival.speed_mps;
                 // An arrival at the very end of the step may come out a rounding later.

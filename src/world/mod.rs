@@ -5,6 +5,7 @@ mod change;
 mod faults;
 mod gate;
 mod gateway;
+mod human;
 mod integrate;
 mod link;
 #[cfg(test)]

@@ -2,8 +2,8 @@
 
 use super::car::Car;
 use super::role::World;
-use crate::conflict::{Duties, Duty, DutyKind, Row};
-use crate::scenario::{PassingOrder, Scenario, VehicleParams, ZoneId};
+use crate::conflict::{Conflicts, Duties, Duty, DutyKind, Row, can_yield, has_gone_first};
+use crate::scenario::{PassingOrder, Scenario, VehicleParams, Zone, ZoneId};
 use crate::shield::{Partner, RESERVE_M, Shield, yielding_slack_m};
 use crate::vehicle::Held;
 use ipc_schemas::Assignment;
@@ -30,23 +30,39 @@ pub(super) enum Standing {
 impl Owed {
     /// Notes whether the vehicle is viable toward its partner as it comes to owe it something, unless nothing is in
     /// force yet. Returns whether it has found that it is not.
-    pub(super) fn judge(&mut self, shield: &Shield, car: &Car, other: &Car, kinds: &[VehicleParams]) -> bool {
-        let Some(partner) = self.partner(car, other, kinds) else { return false };
+    pub(super) fn judge(
+        &mut self,
+        shield: &Shield,
+        car: &Car,
+        other: &Car,
+        kinds: &[VehicleParams],
+        is_human: bool,
+    ) -> bool {
+        let Some(partner) = self.partner(car, other, kinds, is_human) else { return false };
         let is_safe = shield.is_viable(car.x_m, car.v_mps, &partner);
         self.standing = if is_safe { Standing::Safe } else { Standing::Unsafe };
         !is_safe
     }
 
-    /// The partner as the shield sees it, while something is owed to it.
-    pub(super) fn partner(&self, car: &Car, other: &Car, kinds: &[VehicleParams]) -> Option<Partner> {
+    /// The partner as the shield sees it, while something is owed to it. Nobody knows what a human will do in the step: it
+    /// may brake fully.
+    pub(super) fn partner(
+        &self,
+        car: &Car,
+        other: &Car,
+        kinds: &[VehicleParams],
+        is_human: bool,
+    ) -> Option<Partner> {
         let duty = &self.duty;
         let kind = duty.in_force(car.x_m, other.x_m)?;
+        let u_min_mps2 = kinds[usize::from(other.kind)].u_min_mps2;
+        let u_mps2 = if is_human { u_min_mps2 } else { other.command_mps2 };
         Some(Partner {
             kind,
             at_m: duty.own_m,
             gap_m: duty.gap_m,
-            braking_mps2: -kinds[usize::from(other.kind)].u_min_mps2,
-            motion: Held::new(other.x_m + duty.shift_m(), other.v_mps, other.command_mps2),
+            braking_mps2: -u_min_mps2,
+            motion: Held::new(other.x_m + duty.shift_m(), other.v_mps, u_mps2),
         })
     }
 }
@@ -79,7 +95,7 @@ impl World {
         for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
             let zone = group[0].zone;
             let shape = self.scenario.network.zones.get(zone as usize);
-            if shape.is_none_or(|shape| shape.order == PassingOrder::Fifo) {
+            if shape.is_none_or(|shape| is_in_order_of_entry(&self.scenario, shape)) {
                 continue;
             }
             let mut ranks: Vec<(u32, u32)> = group.iter().map(|a| (a.rank, a.vehicle)).collect();
@@ -125,10 +141,24 @@ impl World {
             && proposed.iter().enumerate().all(|(at, &second)| {
                 let before = proposed[..at].iter().filter(|&&other| place(other) > place(second));
                 let mut before = before.filter_map(|&other| car(other));
+                let is_human = |car: &Car| scenario.human(car.kind).is_some();
                 before.all(|first| {
                     let second = car(second).expect("the order is one of members");
                     let row =
                         |car: &Car| row(car, &self.kinds[usize::from(car.kind)], &scenario.vehicle, 0, false);
+                    let (a, b) = (row(first), row(second));
+                    match scenario.human(second.kind) {
+                        // Humans among themselves are not held to anything.
+                        Some(_) if is_human(first) => return true,
+                        Some(human) => {
+                            let own = (human, &self.kinds[usize::from(second.kind)]);
+                            let meets = has_points_in_common(conflicts, &a, &b);
+                            let can = human.obeys() && can_yield(own, conflicts, &a, &b, self.longest_m);
+                            return !meets || can;
+                        }
+                        None if is_human(first) && has_gone_first(conflicts, &a, &b) => return true,
+                        None => {}
+                    }
                     let shield = Shield::new(&self.kinds[usize::from(second.kind)], scenario.dt_s());
                     yielding_slack_m(&shield, conflicts, duties, &row(first), &row(second)) >= RESERVE_M
                 })
@@ -161,7 +191,7 @@ impl World {
     }
 
     fn derive_in(&mut self, scenario: &Scenario, zone: usize) {
-        let is_fifo = scenario.network.zones[zone].order == PassingOrder::Fifo;
+        let is_fifo = is_in_order_of_entry(scenario, &scenario.network.zones[zone]);
         if !is_fifo {
             self.adopt_order(scenario, zone);
         }
@@ -204,6 +234,17 @@ impl World {
         self.owed.set(zone, owed);
         self.order.set(zone, order);
     }
+}
+
+/// Whether a zone's vehicles pass in the order in which they came, and nobody needs to say so.
+fn is_in_order_of_entry(scenario: &Scenario, zone: &Zone) -> bool {
+    zone.order == PassingOrder::Fifo && !scenario.has_humans()
+}
+
+/// Whether two vehicles have a conflict point ahead of the second in common.
+fn has_points_in_common(conflicts: &Conflicts, first: &Row, second: &Row) -> bool {
+    let shared = |point: u32| conflicts.uses(first.path).iter().any(|u| u.point == point);
+    conflicts.uses(second.path).iter().any(|own| own.at_m > second.x_m && shared(own.point))
 }
 
 /// Whether two duties of one vehicle are the same, seen at two events: a partner at a merge has become the leader.

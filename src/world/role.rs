@@ -4,6 +4,7 @@ use super::car::Car;
 use super::faults::Faults;
 use super::gate::Gates;
 use super::gateway::Gateway;
+use super::human::Humans;
 use super::integrate::{Entry, Leader};
 use super::link::Links;
 use super::metrics::{CompletedVisit, WorldSummary, ZoneMetrics, ZoneSummaryRow};
@@ -79,6 +80,7 @@ pub struct World {
     pub(super) faults: Option<Box<Faults>>,
     /// Who moves the vehicles, where it is not the world itself.
     pub(super) played: Option<Box<Played>>,
+    pub(super) humans: Option<Box<Humans>>,
 }
 
 /// What there is to know of a zone beside its vehicles.
@@ -189,6 +191,7 @@ impl World {
             gateway: Gateway::new(&scenario, scenario.controllers(1)),
             faults: Faults::of(&scenario),
             played: None,
+            humans: Humans::of(&scenario),
             scenario,
         }
     }
@@ -317,9 +320,11 @@ impl World {
         let state = &self.zones[zone as usize];
         let left_flags = frames::STATE_LEFT | if state.left_now { frames::STATE_LEFT_NOW } else { 0 };
         let (left, members) = self.cars[zone as usize].split_at(state.first());
-        let members = members
-            .iter()
-            .map(move |c| self.record(c, zone, if c.visit.entered { frames::STATE_ENTERED } else { 0 }));
+        let members = members.iter().map(move |c| {
+            let entered = if c.visit.entered { frames::STATE_ENTERED } else { 0 };
+            let passed = if c.visit.passes { frames::STATE_PASSED } else { 0 };
+            self.record(c, zone, entered | passed)
+        });
         left.iter().map(move |c| self.record(c, zone, left_flags)).chain(members)
     }
 
@@ -341,7 +346,7 @@ impl World {
             then_path: car.then_path,
             link: frames::NO_LINK,
             kind: car.kind,
-            flags,
+            flags: if self.is_human(car.kind) { flags | frames::STATE_HUMAN } else { flags },
         }
     }
 
@@ -416,7 +421,14 @@ impl World {
     /// # Errors
     /// When there are vehicles without a command, or whoever moves them cannot.
     pub fn advance(&mut self) -> Result<(), AdvanceError> {
-        let vehicles = self.member_count();
+        let humans = match &self.humans {
+            None => 0,
+            Some(humans) => {
+                let members = (0..self.zones.len()).flat_map(|zone| self.members(zone));
+                members.filter(|car| humans.drive(car.kind)).count()
+            }
+        };
+        let vehicles = self.member_count() - humans;
         let commanded = std::mem::take(&mut self.commanded) as usize;
         if commanded != vehicles {
             return Err(AdvanceError::Uncommanded(vehicles.abs_diff(commanded)));

@@ -231,6 +231,8 @@ impl World {
     /// A world at step 0 whose vehicles a traffic moves.
     pub fn played(scenario: Arc<Scenario>, coordinators: u32, traffic: Box<dyn Traffic>) -> World {
         let mut world = World::new(scenario, coordinators);
+        // Its humans are its own.
+        world.humans = None;
         let summary = TrafficSummary { name: traffic.name(), ..TrafficSummary::default() };
         world.played = Some(Box::new(Played {
             traffic,

@@ -42,7 +42,7 @@ fn scenario() -> Scenario {
         max_time_s: 60.0,
         network: Network { zones: Vec::new(), roads: Vec::new() },
         vehicle: VEHICLE,
-        fleet: vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: VEHICLE }],
+        fleet: vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: VEHICLE, human: None }],
         control: ControlParams {
             reference: ReferenceLaw::Corrected,
             replan: Replan::FromEntry,

@@ -627,7 +627,7 @@ class Session:
                 continue
             start, end = known
             slices[state.zone] = (start if end else i, i + 1)
-            if not state.flags & s.STATE_LEFT and (state.zone, state.path) in drives:
+            if not state.flags & (s.STATE_LEFT | s.STATE_HUMAN) and (state.zone, state.path) in drives:
                 places[state.zone].append(i)
         return [(zone, found, places[zone]) for zone, found in slices.items()]
 

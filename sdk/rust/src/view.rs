@@ -411,7 +411,7 @@ mod tests {
 
     /// What a search through the whole frame finds.
     fn searched(run: &Run, states: &[VehicleState], all: &[Assignment]) -> Vec<Found> {
-        let own = states.iter().filter(|s| s.flags & STATE_LEFT == 0 && run.drives(s.zone, s.path));
+        let own = states.iter().filter(|s| s.is_commanded() && run.drives(s.zone, s.path));
         own.map(|s| {
             let its = all.iter().filter(|a| (a.zone, a.vehicle) == (s.zone, s.vehicle));
             let partners = its.filter_map(|a| {

@@ -5,18 +5,14 @@ use crate::process::ProcessError;
 use crate::transport::iox::IoxFrame;
 use crate::transport::{Frame, Inbox};
 use crate::world::CommandFault;
-use ipc_schemas::{self as frames, ExpectedHeader, HeaderFault, Role, VehicleCommand, VehicleState};
+use ipc_schemas::{ExpectedHeader, HeaderFault, Role, VehicleCommand, VehicleState};
 use std::time::{Duration, Instant};
 
 impl Kit<'_> {
     /// What the kit puts in for the controller: accelerations of 0.
     pub(super) fn substitute(&self, states: &[VehicleState]) -> Vec<VehicleCommand> {
         let drivers = self.world.drivers();
-        let is_own = |s: &&VehicleState| {
-            s.zone != frames::NO_ZONE
-                && s.flags & frames::STATE_LEFT == 0
-                && drivers.of(s.zone, s.path) == INDEX
-        };
+        let is_own = |s: &&VehicleState| s.is_commanded() && drivers.of(s.zone, s.path) == INDEX;
         let own = states.iter().filter(is_own);
         own.map(|s| VehicleCommand { vehicle: s.vehicle, zone: s.zone, ..VehicleCommand::default() })
             .collect()

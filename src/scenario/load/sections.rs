@@ -4,8 +4,8 @@ use super::error::ScenarioError;
 use super::table::{Table, unique_names};
 use crate::scenario::ranges::MAX_KINDS;
 use crate::scenario::{
-    ControlParams, CoordinationParams, EntryRule, LawKind, PassingOrder, VehicleKind, VehicleParams,
-    ViableParams, keys, ranges,
+    ControlParams, CoordinationParams, EntryRule, HumanParams, LawKind, PassingOrder, VehicleKind,
+    VehicleParams, ViableParams, keys, ranges,
 };
 
 /// `[vehicle]`, or the defaults.
@@ -43,7 +43,7 @@ fn read_vehicle(t: &Table<'_>, p: &mut VehicleParams) -> Result<(), ScenarioErro
 /// `[[fleet]]`: kinds of vehicles, each with the keys of `[vehicle]` in which it differs; without it, one kind.
 pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<VehicleKind>, ScenarioError> {
     if root.get("fleet").is_none() {
-        return Ok(vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: *vehicle }]);
+        return Ok(vec![VehicleKind { name: "cav".to_owned(), share: 1.0, vehicle: *vehicle, human: None }]);
     }
     let tables = root.tables("fleet", "a list of kinds of vehicles, each with a name")?;
     let names = unique_names(&tables, "kind of vehicle")?;
@@ -60,9 +60,59 @@ pub(super) fn fleet(root: &Table<'_>, vehicle: &VehicleParams) -> Result<Vec<Veh
             return Err(t.need("v_max_mps", &expected)?.bad(&expected));
         }
         let share = t.number_or(&keys::SHARE, keys::SHARE.default())?;
-        kinds.push(VehicleKind { name: name.to_owned(), share, vehicle: own });
+        let human = human(t, &own)?;
+        kinds.push(VehicleKind { name: name.to_owned(), share, vehicle: own, human });
     }
     Ok(kinds)
+}
+
+/// The human driver of a kind, if it has one.
+fn human(t: &Table<'_>, vehicle: &VehicleParams) -> Result<Option<HumanParams>, ScenarioError> {
+    if !t.chosen(&keys::DRIVER)? {
+        const ONLY: &str = "driver = \"human\" beside it";
+        let mut of_humans = keys::FLEET.iter().skip_while(|key| key.name() != keys::YIELDS.name);
+        let stray = of_humans.find_map(|key| t.get(key.name()));
+        return stray.map_or(Ok(None), |field| Err(field.bad(ONLY)));
+    }
+    let default = HumanParams::DEFAULT;
+    let VehicleParams { v_max_mps, u_min_mps2, .. } = *vehicle;
+    let at_most = |v| v <= v_max_mps && keys::DESIRED.range.contains(v);
+    let expected = format!("{}, at most v_max_mps = {v_max_mps}", keys::DESIRED.range);
+    Ok(Some(HumanParams {
+        yields: t.chosen(&keys::YIELDS)?,
+        desired_mps: t.f64_or(keys::DESIRED.name, v_max_mps, at_most, &expected)?,
+        desired_sd_mps: t.number_or(&keys::DESIRED_SD, default.desired_sd_mps)?,
+        headway_s: t.number_or(&keys::TIME_HEADWAY, default.headway_s)?,
+        jam_gap_m: t.number_or(&keys::JAM_GAP, default.jam_gap_m)?,
+        acceleration_mps2: t.number_or(&keys::IDM_ACCELERATION, default.acceleration_mps2)?,
+        comfortable_mps2: t.number_or(&keys::COMFORTABLE, default.comfortable_mps2)?,
+        delay_s: t.number_or(&keys::DELAY, default.delay_s)?,
+        noise_mps2: t.number_or(&keys::NOISE, default.noise_mps2)?,
+        critical_gap_s: t.number_or(&keys::CRITICAL_GAP, default.critical_gap_s)?,
+        patience_s: t.number_or(&keys::PATIENCE, default.patience_s)?,
+        hardest_mps2: t.number_or(&keys::HARDEST, (-u_min_mps2).max(0.1))?,
+        scares_per_h: t.number_or(&keys::SCARES, default.scares_per_h)?,
+    }))
+}
+
+/// `automated` and `rank` of a road.
+pub(super) fn mixture(t: &Table<'_>, fleet: &[VehicleKind]) -> Result<(Option<f64>, u32), ScenarioError> {
+    const RANK: &str = "an integer from 0 to 1000";
+    let rank = match t.get("rank") {
+        None => 0,
+        Some(field) => match field.integer::<u32>(0, RANK)? {
+            rank @ 0..=1000 => rank,
+            _ => return Err(field.bad(RANK)),
+        },
+    };
+    let Some(field) = t.get(keys::AUTOMATED.name) else { return Ok((None, rank)) };
+    let share = field.within(&keys::AUTOMATED.range)?;
+    let has = |human: bool| fleet.iter().any(|kind| kind.human.is_some() == human && kind.share > 0.0);
+    if share < 1.0 && !has(true) || share > 0.0 && !has(false) {
+        let lacks = if has(true) { "without" } else { "with" };
+        return Err(field.bad(&format!("a kind {lacks} a human driver in the fleet, with a share above 0")));
+    }
+    Ok((Some(share), rank))
 }
 
 /// `law` of `[control]` or of a zone.

@@ -1,0 +1,51 @@
+//! Where a human stops for others, and whether it can be told to.
+
+use super::duties::Row;
+use super::geometry::{Conflicts, PointKind};
+use crate::scenario::{HumanParams, VehicleParams};
+use crate::vehicle::driver::can_be_told;
+
+/// How far before a crossing humans stop, m.
+const BEFORE_CROSSING_M: f64 = 1.0;
+
+/// How far before a point it is that a human stops for others, m.
+pub fn line_before_m(kind: PointKind, jam_gap_m: f64, longest_m: f64) -> f64 {
+    match kind {
+        // Whoever passes the merge first must have its tail beyond the line by then.
+        PointKind::Merge => longest_m + jam_gap_m,
+        PointKind::Crossing => BEFORE_CROSSING_M,
+    }
+}
+
+/// Whether a human that learns now that another is to go first can let it, wherever they meet: it can stop at the line, after
+/// its delay, whatever it does until then. `longest_m` is the length of the longest vehicle.
+pub fn can_yield(
+    (human, vehicle): (&HumanParams, &VehicleParams),
+    conflicts: &Conflicts,
+    first: &Row,
+    second: &Row,
+    longest_m: f64,
+) -> bool {
+    let braking_mps2 = human.hardest_mps2.min(-vehicle.u_min_mps2);
+    conflicts.uses(second.path).iter().filter(|own| own.at_m > second.x_m).all(|own| {
+        let theirs = conflicts.uses(first.path).iter().find(|u| u.point == own.point);
+        if theirs.is_none_or(|theirs| theirs.on_lane_of(own)) {
+            return true;
+        }
+        let kind = conflicts.points()[own.point as usize].kind;
+        let line_m = own.at_m - line_before_m(kind, human.jam_gap_m, longest_m) - second.x_m;
+        can_be_told(human, braking_mps2, line_m, second.v_mps)
+    })
+}
+
+/// Whether a vehicle has passed every point where it meets another that has not passed all of them.
+pub fn has_gone_first(conflicts: &Conflicts, first: &Row, second: &Row) -> bool {
+    let mut meets = false;
+    let all = conflicts.uses(second.path).iter().all(|own| {
+        let theirs = conflicts.uses(first.path).iter().find(|u| u.point == own.point);
+        let Some(theirs) = theirs.filter(|theirs| !theirs.on_lane_of(own)) else { return true };
+        meets |= second.x_m < own.at_m;
+        second.x_m >= own.at_m || first.x_m >= theirs.at_m
+    });
+    meets && all
+}

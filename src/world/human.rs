@@ -1,0 +1,369 @@
+//! Human drivers: what they see, when they notice it, and what they do.
+//!
+//! A driver knows its own position and speed now, and what others do as it was a delay ago. Toward vehicles ahead it
+//! follows the intelligent driver model, within the speed from which it can still stop; where it has to let somebody pass,
+//! a line before the conflict point is what it stops at. Random numbers are hashes of seed, time and vehicle.
+
+use super::car::Car;
+use super::faults::{Draws, Purpose};
+use super::role::World;
+use crate::conflict::{Conflicts, PointKind, line_before_m};
+use crate::lists::Lists;
+use crate::scenario::{HumanParams, Scenario, Source, VehicleParams, Yielding};
+use crate::vehicle::Held;
+use crate::vehicle::driver::{Ahead, reach_s, safe_mps2, wish_mps2};
+use std::collections::{BTreeMap, VecDeque};
+
+/// What they keep from a conflict point at least when they stop for it, m.
+const BEFORE_POINT_M: f64 = 0.1;
+/// Conflict points nearer to each other than this are passed in one go, m.
+const BOX_M: f64 = 12.0;
+/// Slower than this is standing, m/s.
+const STANDING_MPS: f64 = 0.3;
+/// A speed with which nobody is expected sooner than never, m/s.
+const CREEPING_MPS: f64 = 0.1;
+/// Between errors of one driver's acceleration, s.
+const NOISE_S: f64 = 1.0;
+/// How long one brakes for no reason, s.
+const SCARE_S: f64 = 2.0;
+
+/// The human drivers of a run.
+#[derive(Debug)]
+pub(super) struct Humans {
+    /// By kind of vehicle.
+    drivers: Vec<Option<HumanParams>>,
+    minds: BTreeMap<u32, Mind>,
+    draws: Draws,
+    /// By zone and path: who has the right of way by the entrance's rank.
+    ranks: Lists<u32>,
+    /// Place in the passing order by car of the zone that is looked at.
+    places: Vec<u32>,
+    dt_s: f64,
+    longest_m: f64,
+}
+
+/// What one driver remembers.
+#[derive(Debug)]
+struct Mind {
+    /// Added to its position in the zone to have one that grows on, m.
+    base_m: f64,
+    desired_mps: f64,
+    /// Steps for which it has stood.
+    stands: u64,
+    /// What it saw, the oldest first.
+    seen: VecDeque<Seen>,
+    /// Most that is remembered.
+    delay: usize,
+}
+
+/// What is to be seen in one step, in the coordinate that grows on.
+#[derive(Clone, Copy, Debug, Default)]
+struct Seen {
+    /// The vehicle ahead, and the one whose stopping point is nearest.
+    leaders: [Option<Ahead>; 2],
+    stop: Option<Stop>,
+}
+
+/// Where to stop.
+#[derive(Clone, Copy, Debug)]
+struct Stop {
+    line_m: f64,
+    point_m: f64,
+}
+
+impl Stop {
+    /// Where it can still be stopped: at the line, before the point, or nowhere.
+    fn ahead(&self, x_m: f64, v_mps: f64, hardest_mps2: f64) -> Option<Ahead> {
+        let stops_m = x_m + v_mps * v_mps / (2.0 * hardest_mps2);
+        let latest_m = self.point_m - BEFORE_POINT_M;
+        let rear_m = if stops_m <= self.line_m + 1e-6 { self.line_m } else { latest_m };
+        let line = Ahead { rear_m, v_mps: 0.0, braking_mps2: hardest_mps2, gap_m: 0.0 };
+        (stops_m <= latest_m + 1e-6).then_some(line)
+    }
+}
+
+/// A zone as drivers in it see it.
+#[derive(Clone, Copy)]
+struct Scene<'a> {
+    conflicts: &'a Conflicts,
+    cars: &'a [Car],
+    kinds: &'a [VehicleParams],
+    places: &'a [u32],
+    ranks: &'a [u32],
+    longest_m: f64,
+}
+
+impl Humans {
+    /// Those of a scenario, if it has any.
+    pub(super) fn of(scenario: &Scenario) -> Option<Box<Humans>> {
+        if !scenario.has_humans() {
+            return None;
+        }
+        let zones = &scenario.network.zones;
+        let mut ranks = Lists::new(zones.len());
+        for (at, zone) in zones.iter().enumerate() {
+            for path in 0..zone.paths.len() as u32 {
+                ranks.push(
+                    at,
+                    match zone.entrance(path).source {
+                        Some(Source::Road(road)) => scenario.network.roads[road as usize].rank,
+                        _ => u32::MAX,
+                    },
+                );
+            }
+        }
+        Some(Box::new(Humans {
+            drivers: scenario.fleet.iter().map(|kind| kind.human).collect(),
+            minds: BTreeMap::new(),
+            draws: Draws::of(scenario.seed),
+            ranks,
+            places: Vec::new(),
+            dt_s: scenario.dt_s(),
+            longest_m: scenario.fleet.iter().map(|kind| kind.vehicle.length_m).fold(0.0, f64::max),
+        }))
+    }
+
+    /// Whether vehicles of a kind have one.
+    pub(super) fn drive(&self, kind: u16) -> bool {
+        self.drivers[usize::from(kind)].is_some()
+    }
+
+    /// A vehicle has passed the end of a path or link of this length; behind a link nothing is remembered.
+    pub(super) fn pass(&mut self, vehicle: u32, length_m: f64, forgets: bool) {
+        if let Some(mind) = self.minds.get_mut(&vehicle) {
+            mind.base_m += length_m;
+            if forgets {
+                mind.seen.clear();
+            }
+        }
+    }
+
+    /// A vehicle has left the network.
+    pub(super) fn forget(&mut self, vehicle: u32) {
+        self.minds.remove(&vehicle);
+    }
+
+    fn mind(&mut self, car: &Car, human: &HumanParams, v_max_mps: f64) -> &mut Mind {
+        let Humans { minds, draws, dt_s, .. } = self;
+        minds.entry(car.vehicle).or_insert_with(|| {
+            let drawn = human.desired_sd_mps * draws.normal(0, car.vehicle, Purpose::Desired);
+            let delay = (human.delay_s / *dt_s + 0.5) as usize;
+            Mind {
+                base_m: 0.0,
+                // Nobody crawls for want of wishing to get on.
+                desired_mps: (human.desired_mps + drawn).max(0.3 * human.desired_mps).min(v_max_mps),
+                stands: 0,
+                seen: VecDeque::with_capacity(delay + 2),
+                delay,
+            }
+        })
+    }
+
+    /// What a driver does over the coming step.
+    fn decide(&mut self, scene: &Scene<'_>, at: usize, human: &HumanParams, step: u64) -> f64 {
+        let car = &scene.cars[at];
+        let vehicle = &scene.kinds[usize::from(car.kind)];
+        let (dt_s, draws) = (self.dt_s, self.draws);
+        let mind = self.mind(car, human, vehicle.v_max_mps);
+        mind.stands = if car.v_mps < STANDING_MPS { mind.stands + 1 } else { 0 };
+        let waited_s = mind.stands as f64 * dt_s;
+        let driver = Driver { human, car, desired_mps: mind.desired_mps, waited_s, vehicle };
+        let base_m = mind.base_m;
+        let mut seen = scene.look(&driver, at);
+        seen.leaders.iter_mut().flatten().for_each(|ahead| ahead.rear_m += base_m);
+        if let Some(stop) = &mut seen.stop {
+            stop.line_m += base_m;
+            stop.point_m += base_m;
+        }
+        if mind.seen.len() > mind.delay {
+            mind.seen.pop_front();
+        }
+        mind.seen.push_back(seen);
+        let noticed = mind.seen[0];
+        let (x_m, v_mps) = (base_m + car.x_m, car.v_mps);
+        let stop = noticed.stop.and_then(|stop| stop.ahead(x_m, v_mps, human.hardest_mps2));
+        let all = || noticed.leaders.iter().flatten().copied().chain(stop);
+        let second = |every_s: f64| (step as f64 * dt_s / every_s) as u64;
+        if human.scares_per_h > 0.0 {
+            let probability = human.scares_per_h * SCARE_S / 3600.0;
+            if draws.uniform(second(SCARE_S), car.vehicle, Purpose::Scare) < probability {
+                return -human.hardest_mps2;
+            }
+        }
+        let mut u_mps2 = wish_mps2(human, mind.desired_mps, x_m, v_mps, all());
+        if human.noise_mps2 > 0.0 {
+            u_mps2 += human.noise_mps2 * draws.normal(second(NOISE_S), car.vehicle, Purpose::Wavering);
+        }
+        u_mps2 = u_mps2.min(human.acceleration_mps2);
+        for ahead in all() {
+            u_mps2 = u_mps2.min(safe_mps2(human.hardest_mps2, x_m, v_mps, &ahead, dt_s));
+        }
+        u_mps2.min((vehicle.v_max_mps - v_mps) / dt_s).max(-human.hardest_mps2)
+    }
+}
+
+/// A driver as it looks around.
+struct Driver<'a> {
+    human: &'a HumanParams,
+    car: &'a Car,
+    vehicle: &'a VehicleParams,
+    desired_mps: f64,
+    waited_s: f64,
+}
+
+/// Two vehicles at a point that both are to pass: distances to it, m.
+struct Meeting {
+    own_m: f64,
+    other_m: f64,
+    /// What has to be driven beyond the point until it is clear, m.
+    clear_m: f64,
+}
+
+impl Scene<'_> {
+    fn look(&self, driver: &Driver<'_>, at: usize) -> Seen {
+        let car = driver.car;
+        let mut seen = Seen::default();
+        let [mut nearest_m, mut stops_m] = [f64::INFINITY; 2];
+        for (index, other) in self.cars.iter().enumerate().filter(|(index, _)| *index != at) {
+            let length_m = self.kinds[usize::from(other.kind)].length_m;
+            self.conflicts.runs((car.path, car.next_path), (other.path, other.next_path), |run| {
+                let there_m = other.x_m - run.other_from_m + run.from_m;
+                let is_on_it = other.x_m >= run.other_from_m || run.other_from_m == 0.0;
+                let is_ahead = there_m > car.x_m || there_m == car.x_m && index < at;
+                if !is_on_it || !is_ahead || car.x_m >= run.to_m || there_m - length_m >= run.to_m {
+                    return;
+                }
+                let braking_mps2 = -self.kinds[usize::from(other.kind)].u_min_mps2;
+                let ahead = Ahead {
+                    rear_m: there_m - length_m,
+                    v_mps: other.v_mps,
+                    braking_mps2,
+                    gap_m: driver.human.jam_gap_m,
+                };
+                if ahead.rear_m < nearest_m {
+                    (nearest_m, seen.leaders[0]) = (ahead.rear_m, Some(ahead));
+                }
+                let stop_m = ahead.rear_m + other.v_mps * other.v_mps / (2.0 * braking_mps2);
+                if stop_m < stops_m {
+                    (stops_m, seen.leaders[1]) = (stop_m, Some(ahead));
+                }
+            });
+        }
+        seen.stop = self.stop(driver, at);
+        seen
+    }
+
+    /// The nearest line at which the driver has to stop.
+    fn stop(&self, driver: &Driver<'_>, at: usize) -> Option<Stop> {
+        let (car, human) = (driver.car, driver.human);
+        let points = self.conflicts.points();
+        let (mut box_m, mut before_m) = (f64::NEG_INFINITY, f64::NEG_INFINITY);
+        for own in self.conflicts.uses(car.path) {
+            if own.at_m - before_m > BOX_M {
+                box_m = own.at_m;
+            }
+            before_m = own.at_m;
+            if own.at_m <= car.x_m {
+                continue;
+            }
+            let point = &points[own.point as usize];
+            let waits = (0..self.cars.len()).filter(|&index| index != at).any(|index| {
+                let other = &self.cars[index];
+                let theirs = self.conflicts.uses(other.path).iter().find(|u| u.point == own.point);
+                let Some(theirs) = theirs.filter(|theirs| !theirs.on_lane_of(own)) else { return false };
+                let length_m = self.kinds[usize::from(other.kind)].length_m;
+                let clear_m = match point.kind {
+                    PointKind::Merge => 0.0,
+                    PointKind::Crossing => point.area_m + length_m,
+                };
+                if other.x_m >= theirs.at_m + clear_m {
+                    return false;
+                }
+                if other.x_m >= theirs.at_m {
+                    return true;
+                }
+                let clear_m = driver.vehicle.length_m + point.area_m;
+                let meeting =
+                    Meeting { own_m: own.at_m - car.x_m, other_m: theirs.at_m - other.x_m, clear_m };
+                match human.yields {
+                    Yielding::Order => self.places[index] < self.places[at],
+                    Yielding::Priority | Yielding::Gap => self.gives_way(driver, other, &meeting),
+                }
+            });
+            if waits {
+                // Where several points are passed in one go, nobody stops among them.
+                let is_entered = box_m <= car.x_m || human.yields == Yielding::Order;
+                let point_m = if is_entered { own.at_m } else { box_m };
+                let before_m = line_before_m(point.kind, human.jam_gap_m, self.longest_m);
+                return Some(Stop { line_m: point_m - before_m, point_m });
+            }
+        }
+        None
+    }
+
+    /// Whether a driver that does not follow the passing order lets another go first.
+    fn gives_way(&self, driver: &Driver<'_>, other: &Car, meeting: &Meeting) -> bool {
+        let Driver { human, car, desired_mps, waited_s, .. } = *driver;
+        let rank = |car: &Car| if human.yields == Yielding::Gap { 0 } else { self.ranks[car.path as usize] };
+        let comes_first = (rank(other), other.entry_time_s, other.vehicle);
+        let has_way = rank(car) > comes_first.0
+            || rank(car) == comes_first.0 && (car.entry_time_s, car.vehicle) < (comes_first.1, comes_first.2);
+        let Meeting { own_m, other_m, clear_m } = *meeting;
+        let clears_s = reach_s(own_m + clear_m, car.v_mps, desired_mps, human.acceleration_mps2);
+        let comes_s = other_m / other.v_mps.max(CREEPING_MPS);
+        let braking_mps2 = -self.kinds[usize::from(other.kind)].u_min_mps2;
+        let stops = |braking_mps2: f64| other.v_mps * other.v_mps / (2.0 * braking_mps2) <= other_m;
+        if has_way {
+            // Nobody insists on it toward one that cannot stop any more.
+            return !stops(braking_mps2) && comes_s < clears_s;
+        }
+        let is_patient = waited_s < human.patience_s || !stops(human.comfortable_mps2.min(braking_mps2));
+        comes_s - clears_s < human.critical_gap_s && is_patient
+    }
+}
+
+impl World {
+    /// Whether a human drives vehicles of this kind.
+    pub(super) fn is_human(&self, kind: u16) -> bool {
+        self.humans.as_ref().is_some_and(|humans| humans.drive(kind))
+    }
+
+    /// Lets human drivers decide what they do over the coming step.
+    pub(super) fn drive_humans(&mut self, scenario: &Scenario) {
+        let Some(mut humans) = self.humans.take() else { return };
+        let dt_s = scenario.dt_s();
+        for zone in 0..self.zones.len() {
+            let first = self.zones[zone].first();
+            if !self.cars[zone][first..].iter().any(|car| humans.drive(car.kind)) {
+                continue;
+            }
+            // Those that have left come first.
+            let mut places = std::mem::take(&mut humans.places);
+            places.clear();
+            places.resize(self.cars[zone].len(), 0);
+            (1..).zip(&self.order[zone]).for_each(|(place, at)| places[*at as usize] = place);
+            let ranks = std::mem::replace(&mut humans.ranks, Lists::new(0));
+            for at in first..self.cars[zone].len() {
+                let Some(human) = humans.drivers[usize::from(self.cars[zone][at].kind)] else { continue };
+                let scene = Scene {
+                    conflicts: &self.conflicts[zone],
+                    cars: &self.cars[zone],
+                    kinds: &self.kinds,
+                    places: &places,
+                    ranks: &ranks[zone],
+                    longest_m: humans.longest_m,
+                };
+                let u_mps2 = humans.decide(&scene, at, &human, self.step);
+                let car = &mut self.cars[zone][at];
+                car.command_mps2 = u_mps2;
+                let held = Held::new(car.x_m, car.v_mps, u_mps2);
+                let mut uses = self.conflicts[zone].uses(car.path).iter();
+                // Of those that do as they are told nothing changes with it.
+                car.visit.passes =
+                    !human.obeys() && uses.any(|u| u.at_m > car.x_m && held.passes_m(u.at_m, dt_s).is_some());
+            }
+            (humans.places, humans.ranks) = (places, ranks);
+        }
+        self.humans = Some(humans);
+    }
+}
