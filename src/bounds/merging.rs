@@ -1,13 +1,13 @@
 //! A rigorous bound that knows of merging, whatever the passing order.
 //!
-//! Vehicles are left alone but for disjoint pairs, of two that meet at a merge on different paths: one passes it after
-//! the other, and then finds it at least `phi v + delta` further. A pair costs at least the lesser of its two
-//! orders, and an order at least as much as its Lagrangian dual for any multiplier `mu >= 0` of
+//! Vehicles are left alone but for disjoint pairs, of two that pass one merge: one passes it after the other, and then
+//! finds it at least `phi v + delta` further. A pair costs at least the lesser of its two orders, where both came by
+//! the same lanes that in which they came, and an order at least as much as its Lagrangian dual for any multiplier `mu >= 0` of
 //! `t_second(merge) >= t_first(merge + phi v + delta)`: with the second's speed `v` at the merge given, that is one
 //! vehicle whose time up to the merge is cheaper by `mu` and one whose time up to the further place is dearer by it,
 //! each alone and convex ([`super::alone`]). The second's cost is convex in `v^2`, the first's grows with `v`: cells
 //! of `v` are bounded from below by the ends of the one and the lower end of the other, and split until they are small.
-//! What is left out (other vehicles, same lanes, limits) can only cost.
+//! What is left out (other vehicles, other places, limits) can only cost.
 
 use super::alone::{End, Leg, Optimum, optimum};
 use super::traffic::{Entrant, Traffic, is_merge};
@@ -64,26 +64,29 @@ pub fn bound(traffic: &Traffic<'_>) -> Option<Merging> {
     let shares = traffic.shares();
     let mut gains: Vec<(f64, u32, u32)> = Vec::new();
     for zone in 0..scenario.network.zones.len() as u32 {
-        let mut halves: Vec<(f64, u32, Half<'_>)> = Vec::new();
+        let mut halves: Vec<(f64, Half<'_>)> = Vec::new();
         for entrant in traffic.entrants {
             let Some(at) = entrant.way.iter().position(|(z, _)| *z == zone) else { continue };
             let half = Half::new(traffic, &shares, entrant, at, &setting);
             let passes_s = entrant.arrival_s + half.alone.durations_s[..=at].iter().sum::<f64>();
-            halves.push((passes_s, entrant.way[at].1, half));
+            halves.push((passes_s, half));
         }
         halves.sort_by(|a, b| a.0.total_cmp(&b.0));
-        for (at, (passes_s, path, own)) in halves.iter().enumerate() {
-            for (then_s, other_path, other) in &halves[at + 1..] {
+        for (at, (passes_s, own)) in halves.iter().enumerate() {
+            for (then_s, other) in &halves[at + 1..] {
                 // Further apart than any distance asked for takes at the speeds of vehicles alone.
                 if then_s - passes_s > 2.0 * setting.reaction_s + 0.2 * setting.gap_m {
                     break;
                 }
-                if path != other_path {
-                    let least = setting.order(own, other).min(setting.order(other, own));
-                    let gain = least - own.alone.cost - other.alone.cost;
-                    if gain > 0.0 {
-                        gains.push((gain, own.entrant.vehicle, other.entrant.vehicle));
-                    }
+                let is_behind = own.has_come_the_way_of(other);
+                let least = match own.entrant.arrival_s < other.entrant.arrival_s {
+                    true if is_behind => setting.order(own, other),
+                    false if is_behind => setting.order(other, own),
+                    _ => setting.order(own, other).min(setting.order(other, own)),
+                };
+                let gain = least - own.alone.cost - other.alone.cost;
+                if gain > 0.0 {
+                    gains.push((gain, own.entrant.vehicle, other.entrant.vehicle));
                 }
             }
         }
@@ -121,6 +124,11 @@ impl Half<'_> {
         let priced: Vec<Leg> = legs.iter().map(|&(l, w)| Leg::new(l, w, setting.beta)).collect();
         let alone = optimum(entrant.speed_mps, &priced, End::Free).expect("a free end can be had");
         Half { entrant, before: legs[..=at].to_vec(), after: legs[at + 1..].to_vec(), alone }
+    }
+
+    /// Whether both have been on the same lanes all the way, so that nobody can have passed the other.
+    fn has_come_the_way_of(&self, other: &Half<'_>) -> bool {
+        self.entrant.way[..self.before.len()] == other.entrant.way[..other.before.len()]
     }
 }
 
