@@ -230,6 +230,8 @@ struct Children {
     refused: Vec<RefusedFrames>,
     /// When it was looked last whether programs have changed.
     looked_at_programs: Duration,
+    /// Processes that this one had started before, for something else.
+    bystanders: Vec<u32>,
 }
 
 impl Children {
@@ -263,6 +265,7 @@ impl Children {
             outcome: None,
             refused: Vec::new(),
             looked_at_programs: Duration::ZERO,
+            bystanders: children_of(std::process::id()),
         };
         children.cast(plan, observed);
         Ok(children)
@@ -378,7 +381,8 @@ impl Children {
         // Whoever got away from its keeper by killing it.
         let deadline = Instant::now() + GRACE;
         loop {
-            let orphans = children_of(std::process::id());
+            let mut orphans = children_of(std::process::id());
+            orphans.retain(|process| !self.bystanders.contains(process));
             if orphans.is_empty() || Instant::now() >= deadline {
                 break;
             }
