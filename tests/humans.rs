@@ -68,16 +68,12 @@ fn clean_m(summary: &WorldSummary) -> [f64; 2] {
 
 const NETWORKS: [(&str, f64); 3] = [("two-merges", 400.0), ("intersection", 250.0), ("roundabout", 300.0)];
 
-/// At any share of automated vehicles, in every kind of network with humans who do as they are told, and where lanes only
-/// merge with others too.
+/// At any share of automated vehicles, in every kind of network, with humans of all kinds.
 #[test]
 fn everybody_gets_through() {
     for (network, rate) in NETWORKS {
-        for automated in [0.0, 0.2, 0.5, 0.9] {
+        for automated in [0.0, 0.5, 0.9] {
             for yields in ["order", "priority", "gap"] {
-                if network == "intersection" && yields != "order" {
-                    continue;
-                }
                 let human = format!("yields=\"{yields}\", desired_sd_mps=1, scares_per_h=10");
                 let scenario = mixed(network, automated, &human, rate, 150, 1);
                 let summary = built_in(&scenario);

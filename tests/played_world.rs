@@ -174,8 +174,10 @@ fn who_is_brought_in_and_taken_out_anywhere_is_reckoned_with() {
     let mut run = InProcess::played(&scenario, 1, 1, Box::new(traffic), false);
     let mut orders: Vec<Vec<u32>> = Vec::new();
     while run.step().unwrap() {
-        let members = run.world().records().filter(VehicleState::is_commanded);
-        let order: Vec<u32> = members.map(|s| s.vehicle).collect();
+        let members: Vec<VehicleState> = run.world().records().filter(|s| !s.has_left()).collect();
+        // Nobody is to command the one that somebody else drives, and everybody is told.
+        assert!(members.iter().all(|s| s.is_commanded() == (s.vehicle != 1)), "{members:?}");
+        let order: Vec<u32> = members.iter().map(|s| s.vehicle).collect();
         if orders.last() != Some(&order) {
             orders.push(order);
         }

@@ -88,6 +88,8 @@ pub struct Row {
     pub reach_m: f64,
     /// Whether it has left the zone, and so owes nothing in it.
     pub has_left: bool,
+    /// Whether a human drives it who does not follow the order: nobody enters a box in which it is to pass first.
+    pub is_free: bool,
 }
 
 impl Row {
@@ -105,6 +107,7 @@ impl Row {
             gap_m: own.standstill_gap_m,
             reach_m: own.reaction_time_s * own.v_max_mps,
             has_left: false,
+            is_free: false,
         }
     }
 
@@ -171,7 +174,11 @@ impl Duties {
                 });
             }
             self.ends.push(self.all.len() as u32);
-            self.latest.retain(|&at| (rows[at].path, rows[at].next_path) != (row.path, row.next_path));
+            // Behind who follows the order, those that do not are still to be seen.
+            let is_behind = |other: &Row| row.is_free || !other.is_free;
+            self.latest.retain(|&at| {
+                (rows[at].path, rows[at].next_path) != (row.path, row.next_path) || !is_behind(&rows[at])
+            });
             self.latest.push(place);
         }
     }
@@ -240,7 +247,10 @@ impl Duties {
         let points = conflicts.points();
         for own in conflicts.uses(row.path).iter().filter(|u| row.x_m < u.at_m) {
             let point = &points[own.point as usize];
-            if point.kind != PointKind::Crossing {
+            let is_crossing = point.kind == PointKind::Crossing;
+            // Who is to wait for one that nobody can ask to wait does so before the box.
+            let is_before_box = row.x_m < own.box_m;
+            if !(is_crossing || is_before_box && own.box_m < own.at_m) {
                 continue;
             }
             lanes.clear();
@@ -248,10 +258,14 @@ impl Duties {
                 let other = &rows[at];
                 let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
                 let Some(theirs) = theirs.filter(|u| !u.on_lane_of(own)) else { continue };
+                if !is_crossing && !other.is_free {
+                    continue;
+                }
                 let gap_m = point.area_m + other.length_m;
                 let hides = |&(lane, nearer): &(u32, usize)| {
                     let nearer = &rows[nearer];
                     lane == theirs.lane()
+                        && (nearer.is_free || !other.is_free)
                         && may_hide(conflicts, nearer, other)
                         && goes_along(conflicts, nearer, other, own.point, gap_m + row.reach_m)
                 };
@@ -265,7 +279,7 @@ impl Duties {
                         kind: DutyKind::Cross,
                         partner: other.id,
                         point: own.point,
-                        own_m: own.at_m,
+                        own_m: if other.is_free && is_before_box { own.box_m } else { own.at_m },
                         partner_m: theirs.at_m,
                         gap_m,
                         until_m,

@@ -2,6 +2,10 @@
 
 use crate::scenario::{Network, Zone, ZoneId};
 
+/// Conflict points on a path nearer to each other than this are in one box, m: between two that are further apart
+/// there is room for the longest vehicles.
+const BOX_M: f64 = 25.0;
+
 /// What happens at a conflict point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PointKind {
@@ -29,6 +33,9 @@ pub struct Use {
     pub point: u32,
     /// Distance from the zone's origin on this path, m (the literature's L_k).
     pub at_m: f64,
+    /// Where the box begins that the point is in: the points that follow one another so closely that who stands between
+    /// two of them may stand in others' way, m.
+    pub box_m: f64,
     /// Lane on which the path passes it: paths that pass it on one lane follow each other there.
     lane: u32,
 }
@@ -132,6 +139,12 @@ impl Conflicts {
         for path in &mut conflicts.paths {
             path.uses.sort_by(|a, b| a.at_m.total_cmp(&b.at_m));
             path.meets_from_m = path.uses.first().map_or(f64::INFINITY, |first| first.at_m);
+            for at in 1..path.uses.len() {
+                let before = path.uses[at - 1];
+                if path.uses[at].at_m - before.at_m < BOX_M {
+                    path.uses[at].box_m = before.box_m;
+                }
+            }
         }
         conflicts
     }
@@ -200,7 +213,7 @@ impl Conflicts {
             for (path, own) in zone.paths.iter().zip(&mut self.paths) {
                 let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
                 let at_m = path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
-                own.uses.push(Use { point, at_m, lane: path.segments[at - 1] });
+                own.uses.push(Use { point, at_m, box_m: at_m, lane: path.segments[at - 1] });
             }
         }
         // Where paths end that leave by one exit and have not come together before.
@@ -212,7 +225,7 @@ impl Conflicts {
             }
             let point = self.point(PointKind::Merge, &shape.name, 0.0);
             for own in self.paths.iter_mut().filter(|path| path.exit == exit) {
-                own.uses.push(Use { point, at_m: own.length_m, lane: own.last_segment });
+                own.uses.push(Use { point, at_m: own.length_m, box_m: own.length_m, lane: own.last_segment });
             }
         }
     }
@@ -225,7 +238,12 @@ impl Conflicts {
                     let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
                     let before_m: f64 =
                         path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
-                    own.uses.push(Use { point, at_m: before_m + at_m, lane: segment });
+                    own.uses.push(Use {
+                        point,
+                        at_m: before_m + at_m,
+                        box_m: before_m + at_m,
+                        lane: segment,
+                    });
                 }
             }
         }

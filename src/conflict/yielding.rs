@@ -1,7 +1,7 @@
 //! Where a human stops for others, and whether it can be told to.
 
 use super::duties::Row;
-use super::geometry::{Conflicts, PointKind};
+use super::geometry::{Conflicts, Point, PointKind};
 use crate::scenario::{HumanParams, VehicleParams};
 use crate::vehicle::driver::can_be_told;
 
@@ -35,6 +35,24 @@ pub fn can_yield(
         let kind = conflicts.points()[own.point as usize].kind;
         let line_m = own.at_m - line_before_m(kind, human.jam_gap_m, longest_m) - second.x_m;
         can_be_told(human, braking_mps2, line_m, second.v_mps)
+    })
+}
+
+/// How far beyond a point a vehicle is clear of it, m.
+pub fn clear_m(point: &Point, length_m: f64) -> f64 {
+    match point.kind {
+        PointKind::Merge => 0.0,
+        PointKind::Crossing => point.area_m + length_m,
+    }
+}
+
+/// Whether a vehicle has entered a box in which another has yet to pass a point that it is not clear of.
+pub fn is_in_the_way(conflicts: &Conflicts, inside: &Row, other: &Row) -> bool {
+    conflicts.uses(inside.path).iter().filter(|own| own.box_m <= inside.x_m).any(|own| {
+        let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
+        let point = &conflicts.points()[own.point as usize];
+        inside.x_m < own.at_m + clear_m(point, inside.length_m)
+            && theirs.is_some_and(|theirs| !theirs.on_lane_of(own) && other.x_m < theirs.at_m)
     })
 }
 

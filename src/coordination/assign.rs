@@ -6,7 +6,8 @@ use crate::control::Terminal;
 use crate::scenario::Scenario;
 use ipc_schemas::{
     ASSIGNMENT_FREE_TERMINAL, ASSIGNMENT_PASSED, ASSIGNMENT_PASSED_ONCE, Assignment, CONSTRAINT_CROSS,
-    CONSTRAINT_MERGE, CONSTRAINT_NONE, CONSTRAINT_REAR_END, NO_POINT, NO_VEHICLE, VehicleState, ZoneSummary,
+    CONSTRAINT_MERGE, CONSTRAINT_NONE, CONSTRAINT_REAR_END, NO_POINT, NO_VEHICLE, STATE_HUMAN, VehicleState,
+    ZoneSummary,
 };
 
 /// Makes assignments; kept from use to use for its allocations.
@@ -129,5 +130,6 @@ pub(super) fn row(scenario: &Scenario, state: &VehicleState, id: u32) -> Row {
     let kind = scenario.fleet.get(usize::from(state.kind)).unwrap_or(&scenario.fleet[0]);
     let VehicleState { path, next_path, x_m, v_mps, .. } = *state;
     let has_left = state.has_left();
-    Row { path, next_path, x_m, v_mps, has_left, ..Row::new(&kind.vehicle, &scenario.vehicle, id) }
+    let is_free = state.flags & STATE_HUMAN != 0 && !kind.human.is_some_and(|human| human.obeys());
+    Row { path, next_path, x_m, v_mps, has_left, is_free, ..Row::new(&kind.vehicle, &scenario.vehicle, id) }
 }

@@ -6,10 +6,10 @@
 
 use super::assign::{Assigner, row};
 use super::schedule::{Scene, Scheduler};
-use crate::conflict::{Conflicts, Duties, Row, can_yield, has_gone_first};
-use crate::scenario::{PassingOrder, Scenario, VehicleKind};
+use crate::conflict::{Conflicts, Duties, Row, can_yield, has_gone_first, is_in_the_way};
+use crate::scenario::{HumanParams, PassingOrder, Scenario, VehicleKind, VehicleParams};
 use crate::shield::{RESERVE_M, Shield, yielding_slack_m};
-use ipc_schemas::{STATE_ENTERED, VehicleState};
+use ipc_schemas::{STATE_ENTERED, STATE_HUMAN, VehicleState};
 
 /// A vehicle that lets a newcomer pass first keeps at least this much slack, m: it is not to brake hard for it.
 const YIELDING_SLACK_M: f64 = 0.5;
@@ -61,6 +61,8 @@ pub(super) struct Orders {
     duties: Duties,
     /// An order that is tried.
     tried: Vec<u32>,
+    /// Who stays ahead of a human.
+    stay: Vec<u32>,
     /// Places a newcomer may be put at.
     places: Vec<usize>,
 }
@@ -75,6 +77,7 @@ impl Orders {
             longest_m: scenario.fleet.iter().map(|kind| kind.vehicle.length_m).fold(0.0, f64::max),
             duties: Duties::default(),
             tried: Vec::new(),
+            stay: Vec::new(),
             places: Vec::new(),
         }
     }
@@ -89,6 +92,7 @@ impl Orders {
     ) {
         let Scene { scenario, conflicts, slice, .. } = *scene;
         let members = &slice[slice.iter().take_while(|state| state.has_left()).count()..];
+        self.has_humans |= slice.iter().any(is_human);
         if policy == PassingOrder::Fifo && !self.has_humans {
             order.vehicles.clear();
             order.vehicles.extend(members.iter().map(|state| state.vehicle));
@@ -99,12 +103,15 @@ impl Orders {
         let is_member = |vehicle: u32| members.iter().any(|s| s.vehicle == vehicle && stays(s));
         order.vehicles.retain(|vehicle| is_member(*vehicle));
         order.passed.retain(|(vehicle, _)| is_member(*vehicle));
-        for state in members {
+        for (at, state) in members.iter().enumerate() {
             if order.vehicles.contains(&state.vehicle) {
                 continue;
             }
             match policy {
-                PassingOrder::Fifo => order.vehicles.push(state.vehicle),
+                PassingOrder::Fifo => {
+                    let place = self.place_of_entry(scene, members, &order.vehicles, at);
+                    order.vehicles.insert(place, state.vehicle);
+                }
                 PassingOrder::PerPoint => {
                     let place = self.place(scenario, conflicts, members, &order.vehicles, state);
                     order.vehicles.insert(place, state.vehicle);
@@ -122,9 +129,9 @@ impl Orders {
     fn let_humans_first(&mut self, scene: &Scene<'_>, members: &[VehicleState], order: &mut Order) {
         let Scene { scenario, conflicts, .. } = *scene;
         for state in members {
-            let Some(human) = scenario.human(state.kind) else { continue };
+            let obeys = self.obedient(state).is_some();
             let is_newcomer = state.flags & STATE_ENTERED != 0;
-            if human.obeys() && !is_newcomer {
+            if !is_human(state) || obeys && !is_newcomer {
                 continue;
             }
             let vehicle = state.vehicle;
@@ -136,39 +143,76 @@ impl Orders {
             let waits = |other: &VehicleState| {
                 let first = row(scenario, other, 0);
                 let meets = meeting(conflicts, &first, &own) == Meeting::AtPoints;
-                !meets || self.can_yield(conflicts, state.kind, &first, &own)
+                !meets || self.can_yield(conflicts, state, &first, &own)
             };
-            if human.obeys() && before().all(waits) {
+            if obeys && before().all(waits) {
                 continue;
             }
-            let mut place = own_place;
-            for (at, &other) in order.vehicles[..own_place].iter().enumerate().rev() {
-                let Some(second) = members.iter().find(|s| s.vehicle == other) else { continue };
-                let (first, row) = (row(scenario, state, 0), row(scenario, second, 1));
-                match meeting(conflicts, &first, &row) {
-                    Meeting::Nowhere => continue,
-                    Meeting::OnALane => break,
-                    Meeting::AtPoints => {}
-                }
-                match scenario.human(second.kind) {
-                    Some(other) if !other.obeys() => continue,
-                    _ if self.slack_m(conflicts, second.kind, &first, &row) >= RESERVE_M
-                        || has_gone_first(conflicts, &first, &row) =>
-                    {
-                        place = at;
-                    }
-                    _ => break,
+            let is_moved = |orders: &mut Orders, other: &u32| {
+                let second = members.iter().find(|s| s.vehicle == *other);
+                second.is_some_and(|second| orders.is_to_fall_behind(scene, state, second))
+            };
+            if !order.vehicles[..own_place].iter().any(|other| is_moved(self, other)) {
+                continue;
+            }
+            // Of those before it stay whoever has to, for its sake or for one that stays.
+            let mut stay = std::mem::take(&mut self.stay);
+            stay.clear();
+            let state_of = |vehicle: u32| members.iter().find(|s| s.vehicle == vehicle);
+            for at in (0..own_place).rev() {
+                let Some(second) = state_of(order.vehicles[at]) else { continue };
+                let mut ahead = std::iter::once(state).chain(stay.iter().copied().filter_map(state_of));
+                if !ahead.all(|first| self.may_fall_behind(scene, first, second)) {
+                    stay.push(second.vehicle);
                 }
             }
-            order.vehicles[place..=own_place].rotate_right(1);
+            let is_ahead = |v: &u32| *v == vehicle || stay.contains(v);
+            order.vehicles[..=own_place].sort_by_key(|v| !is_ahead(v));
+            self.stay = stay;
         }
     }
 
+    /// Whether one that was to pass before a human is to pass after it, if it may.
+    fn is_to_fall_behind(&mut self, scene: &Scene<'_>, first: &VehicleState, second: &VehicleState) -> bool {
+        let Scene { scenario, conflicts, .. } = *scene;
+        let (a, b) = (row(scenario, first, 0), row(scenario, second, 1));
+        let is_asked = match b.is_free {
+            true => is_in_the_way(conflicts, &a, &b),
+            false => meeting(conflicts, &a, &b) == Meeting::AtPoints,
+        };
+        is_asked && self.may_fall_behind(scene, first, second)
+    }
+
+    /// Whether one that was to pass before another may be told to let it, or does so anyway.
+    fn may_fall_behind(&mut self, scene: &Scene<'_>, first: &VehicleState, second: &VehicleState) -> bool {
+        let Scene { scenario, conflicts, .. } = *scene;
+        let (a, b) = (row(scenario, first, 0), row(scenario, second, 1));
+        match meeting(conflicts, &a, &b) {
+            Meeting::Nowhere => return true,
+            Meeting::OnALane => return false,
+            Meeting::AtPoints => {}
+        }
+        // In the midst of a box it would wait for one that is to wait for it.
+        if is_in_the_way(conflicts, &b, &a) && !is_in_the_way(conflicts, &a, &b) {
+            return false;
+        }
+        if b.is_free {
+            return is_human(first);
+        }
+        self.slack_m(conflicts, second, &a, &b) >= RESERVE_M
+            || is_human(first) && has_gone_first(conflicts, &a, &b)
+    }
+
+    /// The driver of a vehicle, if it is a human who does as the order says.
+    fn obedient(&self, state: &VehicleState) -> Option<(&HumanParams, &VehicleParams)> {
+        let kind = &self.fleet[usize::from(state.kind).min(self.fleet.len() - 1)];
+        let human = kind.human.as_ref().filter(|human| is_human(state) && human.obeys())?;
+        Some((human, &kind.vehicle))
+    }
+
     /// Whether a human can still let another pass first, if it does as it is told.
-    fn can_yield(&self, conflicts: &Conflicts, kind: u16, first: &Row, second: &Row) -> bool {
-        let kind = &self.fleet[usize::from(kind).min(self.fleet.len() - 1)];
-        let human = kind.human.as_ref().filter(|human| human.obeys());
-        human.is_some_and(|human| can_yield((human, &kind.vehicle), conflicts, first, second, self.longest_m))
+    fn can_yield(&self, conflicts: &Conflicts, state: &VehicleState, first: &Row, second: &Row) -> bool {
+        self.obedient(state).is_some_and(|own| can_yield(own, conflicts, first, second, self.longest_m))
     }
 
     /// Puts a newcomer where the schedule of all costs least: at the end of the order, or ahead of up to three others that
@@ -239,7 +283,7 @@ impl Orders {
             if !is_far || order.times_passed(vehicle) >= MOST_PASSED || forward == MOST_FORWARD {
                 break;
             }
-            if self.slack_m(conflicts, state.kind, &first, &second) < YIELDING_SLACK_M {
+            if self.slack_m(conflicts, state, &first, &second) < YIELDING_SLACK_M {
                 break;
             }
             forward += 1;
@@ -248,8 +292,8 @@ impl Orders {
             let mut before = before.map(|state| row(scenario, state, 0));
             let ahead = before.find(|ahead| meeting(conflicts, &first, ahead) != Meeting::Nowhere);
             let own = Row { id: 1, ..first };
-            let can_follow = ahead
-                .is_none_or(|ahead| self.slack_m(conflicts, newcomer.kind, &ahead, &own) >= YIELDING_SLACK_M);
+            let can_follow =
+                ahead.is_none_or(|ahead| self.slack_m(conflicts, newcomer, &ahead, &own) >= YIELDING_SLACK_M);
             if can_follow {
                 self.places.push(at);
             }
@@ -257,13 +301,22 @@ impl Orders {
     }
 
     /// By how much the second can let the first pass, m; of a human, without bound or not at all.
-    fn slack_m(&mut self, conflicts: &Conflicts, kind: u16, first: &Row, second: &Row) -> f64 {
-        if self.has_humans && self.fleet[usize::from(kind).min(self.fleet.len() - 1)].human.is_some() {
-            let can = self.can_yield(conflicts, kind, first, second);
+    fn slack_m(&mut self, conflicts: &Conflicts, state: &VehicleState, first: &Row, second: &Row) -> f64 {
+        if is_human(state) {
+            let can = self.can_yield(conflicts, state, first, second);
             return if can { f64::INFINITY } else { f64::NEG_INFINITY };
         }
-        let shield = &self.shields[usize::from(kind).min(self.shields.len() - 1)];
+        let shield = &self.shields[usize::from(state.kind).min(self.shields.len() - 1)];
         yielding_slack_m(shield, conflicts, &mut self.duties, first, second)
+    }
+
+    /// Where the member at a place goes in order of entry: at the end, or before those behind it on its lane.
+    fn place_of_entry(&self, scene: &Scene<'_>, members: &[VehicleState], order: &[u32], at: usize) -> usize {
+        let paths = &scene.scenario.network.zones[members[at].zone as usize].paths;
+        let entrance = |state: &VehicleState| paths[state.path as usize].segments[0];
+        let (own, behind) = (entrance(&members[at]), &members[at + 1..]);
+        let is_behind = |v: &u32| behind.iter().any(|s| s.vehicle == *v && entrance(s) == own);
+        order.iter().position(is_behind).unwrap_or(order.len())
     }
 
     /// Where a newcomer goes: before everybody at the end of the order whom it does not meet, or who would reach
@@ -290,13 +343,18 @@ impl Orders {
                 let theirs = conflicts.uses(second.path).iter().find(|u| u.point == own.point);
                 theirs.is_none_or(|theirs| expected_s(newcomer, own.at_m) < expected_s(state, theirs.at_m))
             });
-            if !comes_first || self.slack_m(conflicts, state.kind, &first, &second) < YIELDING_SLACK_M {
+            if !comes_first || self.slack_m(conflicts, state, &first, &second) < YIELDING_SLACK_M {
                 break;
             }
             place = at;
         }
         place
     }
+}
+
+/// Whether somebody drives a vehicle whom nobody commands.
+fn is_human(state: &VehicleState) -> bool {
+    state.flags & STATE_HUMAN != 0
 }
 
 /// Where two vehicles meet.

@@ -46,7 +46,7 @@ pub struct HumanParams {
     pub noise_mps2: f64,
     /// Least time between their passing a point and the arrival of one that they should have let pass, s.
     pub critical_gap_s: f64,
-    /// After this time at a standstill they go ahead of whoever can still let them, s.
+    /// Having stood for this time since they drove last they go ahead of whoever stands, s.
     pub patience_s: f64,
     /// Hardest braking, m/s^2, positive.
     pub hardest_mps2: f64,

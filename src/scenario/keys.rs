@@ -158,7 +158,7 @@ pub(in crate::scenario) static PATIENCE: Number = number(
     "patience_s",
     ranges::HUMAN_TIME,
     10.0,
-    "standing longer than this they go before whoever can stop without haste",
+    "having stood longer than this since they drove last they go before whoever stands",
 );
 pub(in crate::scenario) static HARDEST: Number = without_default(
     "hardest_mps2",

@@ -1,6 +1,7 @@
 //! A vehicle as the world keeps it while it is in a zone or on a link.
 
 use super::way::Way;
+use crate::scenario::{HumanParams, Scenario};
 use crate::vehicle::Held;
 use ipc_schemas::VERDICT_NOMINAL;
 
@@ -153,6 +154,11 @@ impl Car {
             visit: Visit::NEW,
             ..*self
         }
+    }
+
+    /// Whether a human drives it who does not follow the passing order.
+    pub(super) fn is_free(&self, scenario: &Scenario) -> bool {
+        !self.is_commanded && !scenario.human(self.kind).is_some_and(HumanParams::obeys)
     }
 
     /// Where it goes.

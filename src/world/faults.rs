@@ -184,10 +184,9 @@ impl Faults {
         limits: Limits,
         cars: &mut Lists<Car>,
         first: impl Fn(usize) -> usize,
-        is_commanded: impl Fn(&Car) -> bool,
     ) {
         for zone in 0..self.zones {
-            for car in cars[zone][first(zone)..].iter_mut().filter(|car| is_commanded(car)) {
+            for car in cars[zone][first(zone)..].iter_mut().filter(|car| car.is_commanded) {
                 let fate = self.fate(step, time_s, zone as ZoneId, car);
                 self.counts.commands_lost += u64::from(fate == Fate::Lost);
                 self.counts.commands_delayed += u64::from(fate == Fate::Late);

@@ -231,7 +231,7 @@ impl World {
         commands: &[VehicleCommand],
         greatest_verdict: u16,
     ) -> Result<(), CommandFault> {
-        let (kinds, humans) = (&self.kinds, self.humans.as_deref());
+        let kinds = &self.kinds;
         let Gateway { mode, drivers, rows, falls_back, .. } = &mut self.gateway;
         let (mut beyond, mut not_finite) = (0, 0);
         let mut next = 0;
@@ -248,7 +248,7 @@ impl World {
                 if shared && drivers.of(zone, car.path) != sender {
                     continue;
                 }
-                if humans.is_some_and(|humans| humans.drive(car.kind)) {
+                if !car.is_commanded {
                     continue;
                 }
                 let record = next;
@@ -337,7 +337,7 @@ impl World {
             .zones(controller)
             .flat_map(|zone| self.members(zone as usize).iter().map(move |car| (zone, car)));
         members
-            .filter(|(zone, car)| drivers.of(*zone, car.path) == controller && !self.is_human(car.kind))
+            .filter(|(zone, car)| drivers.of(*zone, car.path) == controller && car.is_commanded)
             .map(|(zone, car)| {
                 let memory = memories.get(&(zone, car.vehicle)).map_or_else(VehicleCommand::default, |c| **c);
                 let limits = &self.kinds[usize::from(car.kind)];
@@ -406,15 +406,10 @@ impl World {
         if let Some(faults) = self.faults.as_mut().filter(|faults| faults.has_channels()) {
             let time_s = scenario.time_s(self.step);
             let zones = &self.zones;
-            let humans = self.humans.as_deref();
-            let is_commanded = |car: &Car| !humans.is_some_and(|humans| humans.drive(car.kind));
             let first = |z: usize| zones[z].first();
-            faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, first, is_commanded);
+            faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, first);
         }
         let shields = self.gateway.mode != ShieldMode::Off || self.gateway.falls_back;
-        if self.played.is_some() {
-            self.distrust();
-        }
         for zone in (0..self.zones.len()).rev() {
             if self.links.cars > 0 {
                 self.links.range(zone as u32).for_each(|link| self.drive_link(scenario, zone, link, dt_s));
@@ -429,16 +424,6 @@ impl World {
             self.cars[zone as usize][at].command_mps2 = self.followed(scenario, zone as usize, at).u_mps2;
         }
         self.gateway.falls_back = false;
-    }
-
-    /// Whoever is not commanded may brake fully, for all that is known.
-    fn distrust(&mut self) {
-        for zone in 0..self.zones.len() {
-            let first = self.zones[zone].first();
-            for car in self.cars[zone][first..].iter_mut().filter(|car| !car.is_commanded) {
-                car.command_mps2 = self.kinds[usize::from(car.kind)].u_min_mps2;
-            }
-        }
     }
 
     /// Those that have left a zone move with the vehicles they stand for. With `settling`, what is not settled yet
@@ -499,13 +484,8 @@ impl World {
         let Gateway { mode, shields, drivers, rows, partners, .. } = &mut self.gateway;
         let cars = &mut self.cars[zone];
         let owed = &mut self.owed[zone];
-        let humans = self.humans.as_deref();
-        let is_human = |kind: u16| humans.is_some_and(|humans| humans.drive(kind));
         for &at in &self.order[zone] {
             let car = cars[at as usize];
-            if is_human(car.kind) {
-                continue;
-            }
             let falls_back = car.visit.verdict == frames::VERDICT_FALLBACK;
             if (*mode == ShieldMode::Off && !falls_back) || !car.is_commanded {
                 continue;
@@ -515,13 +495,12 @@ impl World {
             partners.clear();
             for (at, owed) in owed[car.owed.0 as usize..car.owed.1 as usize].iter_mut().enumerate() {
                 let other = &cars[owed.duty.partner as usize];
-                let Some(partner) = owed.partner(&car, other, &self.kinds, is_human(other.kind)) else {
+                let Some(partner) = owed.partner(&car, other, &self.kinds) else {
                     continue;
                 };
                 // Judged when the vehicle comes to owe this partner something, and held to it from then on.
                 if owed.standing == Standing::Unknown {
-                    row.began_unsafe +=
-                        u32::from(owed.judge(shield, &car, other, &self.kinds, is_human(other.kind)));
+                    row.began_unsafe += u32::from(owed.judge(shield, &car, other, &self.kinds));
                 }
                 partners.push((partner, at));
             }
@@ -569,10 +548,8 @@ impl World {
         let last = self.members(to.zone as usize).iter().rev().find(|c| enters(c.path));
         // In a network that closes a circle the zone there may not be settled yet.
         let is_settled = to.zone as usize > zone;
-        let humans = self.humans.as_deref();
-        let is_human = |kind: u16| humans.is_some_and(|humans| humans.drive(kind));
         let mut leader = last.map(|c| {
-            let u_mps2 = if is_settled && !is_human(c.kind) {
+            let u_mps2 = if is_settled && c.is_commanded {
                 c.command_mps2
             } else {
                 self.kinds[usize::from(c.kind)].u_min_mps2

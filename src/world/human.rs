@@ -7,19 +7,18 @@
 use super::car::Car;
 use super::faults::{Draws, Purpose};
 use super::role::World;
-use crate::conflict::{Conflicts, PointKind, line_before_m};
+use crate::conflict::{Conflicts, clear_m, line_before_m};
 use crate::lists::Lists;
 use crate::scenario::{HumanParams, Scenario, Source, VehicleParams, Yielding};
-use crate::vehicle::Held;
 use crate::vehicle::driver::{Ahead, reach_s, safe_mps2, wish_mps2};
 use std::collections::{BTreeMap, VecDeque};
 
 /// What they keep from a conflict point at least when they stop for it, m.
 const BEFORE_POINT_M: f64 = 0.1;
-/// Conflict points nearer to each other than this are passed in one go, m.
-const BOX_M: f64 = 12.0;
 /// Slower than this is standing, m/s.
 const STANDING_MPS: f64 = 0.3;
+/// Faster than this is driving, m/s.
+const DRIVING_MPS: f64 = 3.0;
 /// A speed with which nobody is expected sooner than never, m/s.
 const CREEPING_MPS: f64 = 0.1;
 /// Between errors of one driver's acceleration, s.
@@ -48,7 +47,7 @@ struct Mind {
     /// Added to its position in the zone to have one that grows on, m.
     base_m: f64,
     desired_mps: f64,
-    /// Steps for which it has stood.
+    /// Steps for which it has stood since it drove last.
     stands: u64,
     /// What it saw, the oldest first.
     seen: VecDeque<Seen>,
@@ -165,7 +164,11 @@ impl Humans {
         let vehicle = &scene.kinds[usize::from(car.kind)];
         let (dt_s, draws) = (self.dt_s, self.draws);
         let mind = self.mind(car, human, vehicle.v_max_mps);
-        mind.stands = if car.v_mps < STANDING_MPS { mind.stands + 1 } else { 0 };
+        if car.v_mps < STANDING_MPS {
+            mind.stands += 1;
+        } else if car.v_mps > DRIVING_MPS {
+            mind.stands = 0;
+        }
         let waited_s = mind.stands as f64 * dt_s;
         let driver = Driver { human, car, desired_mps: mind.desired_mps, waited_s, vehicle };
         let base_m = mind.base_m;
@@ -215,6 +218,10 @@ struct Driver<'a> {
 struct Meeting {
     own_m: f64,
     other_m: f64,
+    /// Distance of the other to the box in which the point is, m.
+    other_box_m: f64,
+    /// Whether the driver is in it.
+    is_inside: bool,
     /// What has to be driven beyond the point until it is clear, m.
     clear_m: f64,
 }
@@ -257,34 +264,27 @@ impl Scene<'_> {
     fn stop(&self, driver: &Driver<'_>, at: usize) -> Option<Stop> {
         let (car, human) = (driver.car, driver.human);
         let points = self.conflicts.points();
-        let (mut box_m, mut before_m) = (f64::NEG_INFINITY, f64::NEG_INFINITY);
-        for own in self.conflicts.uses(car.path) {
-            if own.at_m - before_m > BOX_M {
-                box_m = own.at_m;
-            }
-            before_m = own.at_m;
-            if own.at_m <= car.x_m {
-                continue;
-            }
+        for own in self.conflicts.uses(car.path).iter().filter(|own| own.at_m > car.x_m) {
+            let is_inside = own.box_m <= car.x_m;
             let point = &points[own.point as usize];
             let waits = (0..self.cars.len()).filter(|&index| index != at).any(|index| {
                 let other = &self.cars[index];
                 let theirs = self.conflicts.uses(other.path).iter().find(|u| u.point == own.point);
                 let Some(theirs) = theirs.filter(|theirs| !theirs.on_lane_of(own)) else { return false };
                 let length_m = self.kinds[usize::from(other.kind)].length_m;
-                let clear_m = match point.kind {
-                    PointKind::Merge => 0.0,
-                    PointKind::Crossing => point.area_m + length_m,
-                };
-                if other.x_m >= theirs.at_m + clear_m {
+                if other.x_m >= theirs.at_m + clear_m(point, length_m) {
                     return false;
                 }
                 if other.x_m >= theirs.at_m {
                     return true;
                 }
-                let clear_m = driver.vehicle.length_m + point.area_m;
-                let meeting =
-                    Meeting { own_m: own.at_m - car.x_m, other_m: theirs.at_m - other.x_m, clear_m };
+                let meeting = Meeting {
+                    own_m: own.at_m - car.x_m,
+                    other_m: theirs.at_m - other.x_m,
+                    other_box_m: theirs.box_m - other.x_m,
+                    is_inside,
+                    clear_m: driver.vehicle.length_m + point.area_m,
+                };
                 match human.yields {
                     Yielding::Order => self.places[index] < self.places[at],
                     Yielding::Priority | Yielding::Gap => self.gives_way(driver, other, &meeting),
@@ -292,8 +292,8 @@ impl Scene<'_> {
             });
             if waits {
                 // Where several points are passed in one go, nobody stops among them.
-                let is_entered = box_m <= car.x_m || human.yields == Yielding::Order;
-                let point_m = if is_entered { own.at_m } else { box_m };
+                let stops_here = is_inside || human.yields == Yielding::Order;
+                let point_m = if stops_here { own.at_m } else { own.box_m };
                 let before_m = line_before_m(point.kind, human.jam_gap_m, self.longest_m);
                 return Some(Stop { line_m: point_m - before_m, point_m });
             }
@@ -308,33 +308,36 @@ impl Scene<'_> {
         let comes_first = (rank(other), other.entry_time_s, other.vehicle);
         let has_way = rank(car) > comes_first.0
             || rank(car) == comes_first.0 && (car.entry_time_s, car.vehicle) < (comes_first.1, comes_first.2);
-        let Meeting { own_m, other_m, clear_m } = *meeting;
-        let clears_s = reach_s(own_m + clear_m, car.v_mps, desired_mps, human.acceleration_mps2);
-        let comes_s = other_m / other.v_mps.max(CREEPING_MPS);
-        let braking_mps2 = -self.kinds[usize::from(other.kind)].u_min_mps2;
-        let stops = |braking_mps2: f64| other.v_mps * other.v_mps / (2.0 * braking_mps2) <= other_m;
-        if has_way {
-            // Nobody insists on it toward one that cannot stop any more.
-            return !stops(braking_mps2) && comes_s < clears_s;
+        let Meeting { own_m, other_m, other_box_m, is_inside, clear_m } = *meeting;
+        if !is_inside && other_box_m <= 0.0 {
+            // It is in the midst of it.
+            return true;
         }
-        let is_patient = waited_s < human.patience_s || !stops(human.comfortable_mps2.min(braking_mps2));
+        let clears_s = reach_s(own_m + clear_m, car.v_mps, desired_mps, human.acceleration_mps2);
+        // Whoever has the way may make use of it from now on.
+        let comes_s = match has_way || is_inside {
+            true => other_m / other.v_mps.max(CREEPING_MPS),
+            false => reach_s(other_m, other.v_mps, desired_mps, human.acceleration_mps2),
+        };
+        let braking_mps2 = -self.kinds[usize::from(other.kind)].u_min_mps2;
+        let stops_by_m = if other_box_m > 0.0 { other_box_m } else { other_m };
+        let stops = other.v_mps * other.v_mps / (2.0 * braking_mps2) <= stops_by_m;
+        if has_way || is_inside {
+            // Nobody insists on it toward one that cannot stop any more.
+            return !stops && comes_s < clears_s;
+        }
+        let is_patient = waited_s < human.patience_s || other.v_mps >= STANDING_MPS;
         comes_s - clears_s < human.critical_gap_s && is_patient
     }
 }
 
 impl World {
-    /// Whether a human drives vehicles of this kind.
-    pub(super) fn is_human(&self, kind: u16) -> bool {
-        self.humans.as_ref().is_some_and(|humans| humans.drive(kind))
-    }
-
     /// Lets human drivers decide what they do over the coming step.
-    pub(super) fn drive_humans(&mut self, scenario: &Scenario) {
+    pub(super) fn drive_humans(&mut self) {
         let Some(mut humans) = self.humans.take() else { return };
-        let dt_s = scenario.dt_s();
         for zone in 0..self.zones.len() {
             let first = self.zones[zone].first();
-            if !self.cars[zone][first..].iter().any(|car| humans.drive(car.kind)) {
+            if !self.cars[zone][first..].iter().any(|car| !car.is_commanded) {
                 continue;
             }
             // Those that have left come first.
@@ -354,13 +357,7 @@ impl World {
                     longest_m: humans.longest_m,
                 };
                 let u_mps2 = humans.decide(&scene, at, &human, self.step);
-                let car = &mut self.cars[zone][at];
-                car.command_mps2 = u_mps2;
-                let held = Held::new(car.x_m, car.v_mps, u_mps2);
-                let mut uses = self.conflicts[zone].uses(car.path).iter();
-                // Of those that do as they are told nothing changes with it.
-                car.visit.passes =
-                    !human.obeys() && uses.any(|u| u.at_m > car.x_m && held.passes_m(u.at_m, dt_s).is_some());
+                self.cars[zone][at].command_mps2 = u_mps2;
             }
             (humans.places, humans.ranks) = (places, ranks);
         }

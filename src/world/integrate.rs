@@ -29,6 +29,15 @@ pub(super) struct Leader {
     motion: Option<(Held, u16)>,
 }
 
+/// What a look at a zone finds of the coming step.
+#[derive(Clone, Copy, Debug)]
+struct Looked {
+    /// Somebody leaves it.
+    crosses: bool,
+    /// A human who does not follow the passing order passes a conflict point.
+    passes: bool,
+}
+
 impl World {
     /// Integrates from the present step to the next with the commands in force.
     pub(super) fn integrate(&mut self) -> Result<(), AdvanceError> {
@@ -36,7 +45,7 @@ impl World {
         let dt_s = scenario.dt_s();
         let now_s = scenario.time_s(self.step);
         self.derive_duties(&scenario);
-        self.drive_humans(&scenario);
+        self.drive_humans();
         // Where vehicles in zones depend on nobody's command but their own, each zone settles what they hold
         // as its turn comes: what is downstream of it has not moved yet.
         let alone =
@@ -64,10 +73,9 @@ impl World {
             if alone {
                 self.hold_left(&scenario, zone, false);
             }
-            let crosses = self.look(zone, dt_s);
+            let Looked { crosses, passes } = self.look(&scenario, zone, dt_s);
             self.observe_overlaps(&scenario, zone, dt_s);
             self.zones[zone].left_now = crosses;
-            let passes = self.humans.is_some() && self.members(zone).iter().any(|car| car.visit.passes);
             if crosses {
                 self.cross(&scenario, zone, now_s, dt_s);
             }
@@ -102,14 +110,14 @@ impl World {
     }
 
     /// Works out the motions of a zone's cars, updates the least margins over the step, and judges, when a vehicle
-    /// comes to owe somebody something, whether it is viable toward it. Returns whether a vehicle leaves the zone.
-    fn look(&mut self, zone: usize, dt_s: f64) -> bool {
+    /// comes to owe somebody something, whether it is viable toward it.
+    fn look(&mut self, scenario: &Scenario, zone: usize, dt_s: f64) -> Looked {
         let lengths_m = &self.lengths_m[zone];
         let owed = &mut self.owed[zone];
         let metrics = &mut self.metrics[zone];
         let motions = &mut self.scratch.motions;
         let cars = &mut self.cars[zone];
-        let mut leaves = false;
+        let mut looked = Looked { crosses: false, passes: false };
         motions.clear();
         motions.extend(cars.iter().map(Car::held));
         for i in self.zones[zone].first()..cars.len() {
@@ -123,14 +131,18 @@ impl World {
                 _ => {}
             }
             let after_s = held.passes_m(lengths_m[car.path as usize], dt_s);
-            leaves |= after_s.is_some();
+            looked.crosses |= after_s.is_some();
             let mut lacks_m = 0.0_f64;
+            if car.is_free(scenario) {
+                let mut uses = self.conflicts[zone].uses(car.path).iter();
+                visit.passes = uses.any(|u| u.at_m > car.x_m && held.passes_m(u.at_m, dt_s).is_some());
+                looked.passes |= visit.passes;
+            }
             // What humans keep is theirs to judge.
-            let is_human = self.humans.as_ref().is_some_and(|humans| humans.drive(car.kind));
-            for owed in if is_human { &mut [][..] } else { owed } {
+            for owed in if car.is_commanded { owed } else { &mut [][..] } {
                 let other = &cars[owed.duty.partner as usize];
                 if owed.standing == Standing::Unknown {
-                    owed.judge(&self.gateway.shields[usize::from(car.kind)], &car, other, &self.kinds, false);
+                    owed.judge(&self.gateway.shields[usize::from(car.kind)], &car, other, &self.kinds);
                 }
                 let Owed { duty, standing, .. } = &*owed;
                 let Some(kind) = duty.in_force(car.x_m, other.x_m) else { continue };
@@ -166,7 +178,7 @@ impl World {
             visit.exposure_m_s += lacks_m * counts_s;
             cars[i].visit = visit;
         }
-        leaves
+        looked
     }
 
     /// Takes out the vehicles that leave the zone during the step and sends them on.
@@ -194,6 +206,7 @@ impl World {
         for (after_s, car, held) in &*leaving {
             let (after_s, length_m) = (*after_s, lengths_m[car.path as usize]);
             let exit = car.beyond.exit;
+            self.uncommanded -= usize::from(!car.is_commanded);
             let mut visit = car.visit;
             visit.energy += held.energy(after_s);
             let instant_s = now_s + after_s;
@@ -345,6 +358,7 @@ impl World {
                 car.visit.wait_s = now_s + after_s - arrival.time_s;
                 let held = Held::new(-speed_mps * after_s, speed_mps, 0.0);
                 car.x_m = held.position_m(dt_s);
+                car.is_commanded = !self.humans.as_ref().is_some_and(|humans| humans.drive(kind));
                 if let Some(played) = &mut self.played {
                     let (kind, way) = (u32::from(kind), ways.whole(way, id, zone));
                     let Car { x_m, v_mps, .. } = car;
@@ -396,6 +410,7 @@ impl World {
                 self.cars[zone][first..].iter().position(is_behind).map(|place| first + place)
             });
             self.cars.push(zone, entry.car);
+            self.uncommanded += usize::from(!entry.car.is_commanded);
             if let Some(place) = place {
                 self.cars[zone][place..].rotate_right(1);
             }

@@ -30,15 +30,8 @@ pub(super) enum Standing {
 impl Owed {
     /// Notes whether the vehicle is viable toward its partner as it comes to owe it something, unless nothing is in
     /// force yet. Returns whether it has found that it is not.
-    pub(super) fn judge(
-        &mut self,
-        shield: &Shield,
-        car: &Car,
-        other: &Car,
-        kinds: &[VehicleParams],
-        is_human: bool,
-    ) -> bool {
-        let Some(partner) = self.partner(car, other, kinds, is_human) else { return false };
+    pub(super) fn judge(&mut self, shield: &Shield, car: &Car, other: &Car, kinds: &[VehicleParams]) -> bool {
+        let Some(partner) = self.partner(car, other, kinds) else { return false };
         let is_safe = shield.is_viable(car.x_m, car.v_mps, &partner);
         self.standing = if is_safe { Standing::Safe } else { Standing::Unsafe };
         !is_safe
@@ -46,17 +39,11 @@ impl Owed {
 
     /// The partner as the shield sees it, while something is owed to it. Nobody knows what a human will do in the step: it
     /// may brake fully.
-    pub(super) fn partner(
-        &self,
-        car: &Car,
-        other: &Car,
-        kinds: &[VehicleParams],
-        is_human: bool,
-    ) -> Option<Partner> {
+    pub(super) fn partner(&self, car: &Car, other: &Car, kinds: &[VehicleParams]) -> Option<Partner> {
         let duty = &self.duty;
         let kind = duty.in_force(car.x_m, other.x_m)?;
         let u_min_mps2 = kinds[usize::from(other.kind)].u_min_mps2;
-        let u_mps2 = if is_human { u_min_mps2 } else { other.command_mps2 };
+        let u_mps2 = if other.is_commanded { other.command_mps2 } else { u_min_mps2 };
         Some(Partner {
             kind,
             at_m: duty.own_m,
@@ -95,7 +82,7 @@ impl World {
         for group in assignments.chunk_by(|a, b| a.zone == b.zone) {
             let zone = group[0].zone;
             let shape = self.scenario.network.zones.get(zone as usize);
-            if shape.is_none_or(|shape| is_in_order_of_entry(&self.scenario, shape)) {
+            if shape.is_none_or(|shape| self.is_in_order_of_entry(shape)) {
                 continue;
             }
             let mut ranks: Vec<(u32, u32)> = group.iter().map(|a| (a.rank, a.vehicle)).collect();
@@ -119,9 +106,15 @@ impl World {
         let Order { known, proposed, refused } = self.orders.entry(zone as u32).or_default();
         // One that has come back within a step, by a way from the zone to itself, is a newcomer too.
         known.retain(|vehicle| members.iter().any(|car| car.vehicle == *vehicle && !car.visit.entered));
-        for car in members {
+        let paths = &scenario.network.zones[zone].paths;
+        let entrance = |car: &Car| paths[car.path as usize].segments[0];
+        for (at, car) in members.iter().enumerate() {
             if !known.contains(&car.vehicle) {
-                known.push(car.vehicle);
+                // One that was brought in ahead of others on its lane passes before them.
+                let behind = |v: &u32| {
+                    members[at + 1..].iter().any(|c| c.vehicle == *v && entrance(c) == entrance(car))
+                };
+                known.insert(known.iter().position(behind).unwrap_or(known.len()), car.vehicle);
             }
         }
         let Some((step, proposed)) = proposed.take() else { return };
@@ -141,23 +134,21 @@ impl World {
             && proposed.iter().enumerate().all(|(at, &second)| {
                 let before = proposed[..at].iter().filter(|&&other| place(other) > place(second));
                 let mut before = before.filter_map(|&other| car(other));
-                let is_human = |car: &Car| scenario.human(car.kind).is_some();
                 before.all(|first| {
                     let second = car(second).expect("the order is one of members");
-                    let row =
-                        |car: &Car| row(car, &self.kinds[usize::from(car.kind)], &scenario.vehicle, 0, false);
+                    let row = |car: &Car| row(car, &self.kinds, scenario, 0, false);
                     let (a, b) = (row(first), row(second));
-                    match scenario.human(second.kind) {
+                    match (first.is_commanded, second.is_commanded) {
                         // Humans among themselves are not held to anything.
-                        Some(_) if is_human(first) => return true,
-                        Some(human) => {
-                            let own = (human, &self.kinds[usize::from(second.kind)]);
-                            let meets = has_points_in_common(conflicts, &a, &b);
-                            let can = human.obeys() && can_yield(own, conflicts, &a, &b, self.longest_m);
-                            return !meets || can;
+                        (false, false) => return true,
+                        (true, false) => {
+                            let own = &self.kinds[usize::from(second.kind)];
+                            let human = scenario.human(second.kind).filter(|human| human.obeys());
+                            let waits = |human| can_yield((human, own), conflicts, &a, &b, self.longest_m);
+                            return !has_points_in_common(conflicts, &a, &b) || human.is_some_and(waits);
                         }
-                        None if is_human(first) && has_gone_first(conflicts, &a, &b) => return true,
-                        None => {}
+                        (false, true) if has_gone_first(conflicts, &a, &b) => return true,
+                        (_, true) => {}
                     }
                     let shield = Shield::new(&self.kinds[usize::from(second.kind)], scenario.dt_s());
                     yielding_slack_m(&shield, conflicts, duties, &row(first), &row(second)) >= RESERVE_M
@@ -190,8 +181,13 @@ impl World {
         }
     }
 
+    /// Whether a zone's vehicles pass in the order in which they came, and nobody needs to say so.
+    fn is_in_order_of_entry(&self, zone: &Zone) -> bool {
+        zone.order == PassingOrder::Fifo && !self.has_humans
+    }
+
     fn derive_in(&mut self, scenario: &Scenario, zone: usize) {
-        let is_fifo = is_in_order_of_entry(scenario, &scenario.network.zones[zone]);
+        let is_fifo = self.is_in_order_of_entry(&scenario.network.zones[zone]);
         if !is_fifo {
             self.adopt_order(scenario, zone);
         }
@@ -214,7 +210,7 @@ impl World {
         let kinds = &self.kinds;
         rows.extend((0..first as u32).chain(order.iter().copied()).map(|at| {
             let car = &cars[at as usize];
-            row(car, &kinds[usize::from(car.kind)], &scenario.vehicle, at, (at as usize) < first)
+            row(car, kinds, scenario, at, (at as usize) < first)
         }));
         duties.derive(&self.conflicts[zone], rows);
         owed.clear();
@@ -236,11 +232,6 @@ impl World {
     }
 }
 
-/// Whether a zone's vehicles pass in the order in which they came, and nobody needs to say so.
-fn is_in_order_of_entry(scenario: &Scenario, zone: &Zone) -> bool {
-    zone.order == PassingOrder::Fifo && !scenario.has_humans()
-}
-
 /// Whether two vehicles have a conflict point ahead of the second in common.
 fn has_points_in_common(conflicts: &Conflicts, first: &Row, second: &Row) -> bool {
     let shared = |point: u32| conflicts.uses(first.path).iter().any(|u| u.point == point);
@@ -253,7 +244,16 @@ fn is_same(old: &Duty, old_partner: u32, new: &Duty, new_partner: u32) -> bool {
     old_partner == new_partner && crosses(old) == crosses(new)
 }
 
-fn row(car: &Car, own: &VehicleParams, reference: &VehicleParams, id: u32, has_left: bool) -> Row {
-    let Car { path, next_path, x_m, v_mps, .. } = *car;
-    Row { path, next_path, x_m, v_mps, has_left, ..Row::new(own, reference, id) }
+fn row(car: &Car, kinds: &[VehicleParams], scenario: &Scenario, id: u32, has_left: bool) -> Row {
+    let Car { path, next_path, x_m, v_mps, kind, .. } = *car;
+    let is_free = car.is_free(scenario);
+    Row {
+        path,
+        next_path,
+        x_m,
+        v_mps,
+        has_left,
+        is_free,
+        ..Row::new(&kinds[usize::from(kind)], &scenario.vehicle, id)
+    }
 }

@@ -81,6 +81,9 @@ pub struct World {
     /// Who moves the vehicles, where it is not the world itself.
     pub(super) played: Option<Box<Played>>,
     pub(super) humans: Option<Box<Humans>>,
+    /// Whether there are, or may be, vehicles that somebody else drives; and how many of them are in zones.
+    pub(super) has_humans: bool,
+    pub(super) uncommanded: usize,
 }
 
 /// What there is to know of a zone beside its vehicles.
@@ -192,6 +195,8 @@ impl World {
             faults: Faults::of(&scenario),
             played: None,
             humans: Humans::of(&scenario),
+            has_humans: scenario.has_humans(),
+            uncommanded: 0,
             scenario,
         }
     }
@@ -346,7 +351,7 @@ impl World {
             then_path: car.then_path,
             link: frames::NO_LINK,
             kind: car.kind,
-            flags: if self.is_human(car.kind) { flags | frames::STATE_HUMAN } else { flags },
+            flags: if car.is_commanded { flags } else { flags | frames::STATE_HUMAN },
         }
     }
 
@@ -421,14 +426,7 @@ impl World {
     /// # Errors
     /// When there are vehicles without a command, or whoever moves them cannot.
     pub fn advance(&mut self) -> Result<(), AdvanceError> {
-        let humans = match &self.humans {
-            None => 0,
-            Some(humans) => {
-                let members = (0..self.zones.len()).flat_map(|zone| self.members(zone));
-                members.filter(|car| humans.drive(car.kind)).count()
-            }
-        };
-        let vehicles = self.member_count() - humans;
+        let vehicles = self.member_count() - self.uncommanded;
         let commanded = std::mem::take(&mut self.commanded) as usize;
         if commanded != vehicles {
             return Err(AdvanceError::Uncommanded(vehicles.abs_diff(commanded)));

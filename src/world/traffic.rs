@@ -371,6 +371,7 @@ impl World {
             let mut car = Car::arriving(id, way, newcomer.kind as u16, now_s + dt_s - inside_s, v_mps);
             car.x_m = x_m;
             car.is_commanded = newcomer.is_commanded != 0;
+            self.has_humans |= !car.is_commanded;
             self.gates.pass(None, Some((zone, path)));
             self.scratch.entries.push(Entry { zone, car });
             Ok(())
@@ -396,10 +397,11 @@ impl World {
             let zone = admitted.way[0].0 as usize;
             let first = self.zones[zone].first();
             let members = &mut self.cars[zone][first..];
-            members
-                .iter_mut()
-                .filter(|car| car.vehicle == admitted.vehicle)
-                .for_each(|car| car.is_commanded = false);
+            if let Some(car) = members.iter_mut().find(|car| car.vehicle == admitted.vehicle) {
+                car.is_commanded = false;
+                self.uncommanded += 1;
+            }
+            self.has_humans = true;
         }
         played.admitted.clear();
         self.played = Some(played);
@@ -413,6 +415,7 @@ impl World {
         let first = self.zones[at].first();
         let mut cars = self.cars[at].to_vec();
         let mut car = cars.remove(first + place);
+        self.uncommanded -= usize::from(!car.is_commanded);
         self.metrics[at].observe(&car.visit);
         self.gates.pass(Some((zone, car.path)), None);
         car.x_m = self.lengths_m[at][car.path as usize] + OUT_OF_SIGHT_M;
