@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds every example controller and runs it on zone 2 of the default scenario, as CI does.
+# Builds every example controller and runs it on zone 2 of the default scenario, and every example world, as CI does.
 # Usage: examples/run_all.sh [PROFILE]   (release by default)
 set -eu
 cd "$(dirname "$0")/.."
@@ -12,6 +12,7 @@ trap 'rm -rf "$work"' EXIT
 cargo build $flag --bins
 cargo build $flag -p control-zones-c
 cargo build $flag -p control-zones-plugin --example mpc
+cargo build $flag --example world -p control-zones-env
 cz=target/$profile/cz
 
 python=${CZ_PYTHON:-}
@@ -30,4 +31,11 @@ for controller in "$work/headway" "$work/idm" "target/$profile/examples/mpc" "$p
     echo "== $controller"
     "$cz" plugin check -- $controller
     "$cz" run --controller merge-2="$controller"
+done
+
+export CZ_ENV_LIBRARY="$PWD/target/$profile/libcontrol_zones_env.so"
+for world in "target/$profile/examples/world" "$python examples/python/world.py"; do
+    echo "== $world"
+    "$cz" world check -- $world
+    "$cz" run --world "$world"
 done

@@ -1,12 +1,13 @@
 //! A world that others play: whoever moves the vehicles, the rest of the run does not notice.
 
+#[allow(dead_code)] // its `main`
+#[path = "../examples/rust/world.rs"]
+mod world;
+
 use control_zones::lockstep::LockstepError;
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{Override, Scenario, load};
-use control_zones::vehicle::Held;
-use control_zones::world::{
-    Admitted, AdvanceError, Coming, Done, Newcomer, Task, Traffic, TrafficError, WorldSummary,
-};
+use control_zones::world::{AdvanceError, Coming, Done, Newcomer, Task, Traffic, TrafficError, WorldSummary};
 use ipc_schemas::VehicleState;
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -14,46 +15,6 @@ use std::sync::Arc;
 fn scenario(name: &str, sets: &[&str]) -> Arc<Scenario> {
     let sets: Vec<Override> = sets.iter().map(|set| set.parse().expect("a setting")).collect();
     Arc::new(load(Some(name), &sets, None).expect("it loads"))
-}
-
-/// Moves everybody as commanded, by a clock and an integration of its own.
-#[derive(Debug)]
-struct Obedient {
-    dt_s: f64,
-    speeds_mps: BTreeMap<u32, f64>,
-}
-
-impl Traffic for Obedient {
-    fn name(&self) -> String {
-        "obedient".to_owned()
-    }
-
-    fn brings(&self) -> bool {
-        false
-    }
-
-    fn step(
-        &mut self,
-        _step: u64,
-        tasks: &[Task],
-        done: &mut [Done],
-        _newcomers: &mut Vec<Newcomer>,
-    ) -> Result<Coming, TrafficError> {
-        for (task, done) in tasks.iter().zip(done) {
-            let v_mps = self.speeds_mps.get_mut(&task.vehicle).expect("it was admitted");
-            let held = Held::new(0.0, *v_mps, if task.is_held == 1 { task.u_mps2 } else { 0.0 });
-            *v_mps = held.speed_mps(self.dt_s);
-            *done = Done { advanced_m: held.position_m(self.dt_s), v_mps: *v_mps };
-        }
-        Ok(Coming::Nobody)
-    }
-
-    fn admit(&mut self, vehicles: &mut [Admitted]) -> Result<(), TrafficError> {
-        for admitted in vehicles {
-            assert!(self.speeds_mps.insert(admitted.vehicle, admitted.v_mps).is_none(), "each comes once");
-        }
-        Ok(())
-    }
 }
 
 fn played(scenario: &Arc<Scenario>, traffic: Box<dyn Traffic>) -> Result<WorldSummary, LockstepError> {
@@ -74,8 +35,7 @@ fn who_does_as_told_comes_to_the_results_of_our_own_world() {
         let mut own = InProcess::new(&scenario, 1, 1);
         own.run().unwrap();
         let own = own.world().summary();
-        let traffic = Obedient { dt_s: scenario.dt_s(), speeds_mps: BTreeMap::new() };
-        let other = played(&scenario, Box::new(traffic)).unwrap();
+        let other = played(&scenario, Box::<world::Points>::default()).unwrap();
         assert_eq!((other.arrived, other.departed), (own.arrived, own.departed), "{name}");
         assert!(own.departed > 10, "{name}: {} have left", own.departed);
         for (a, b) in own.zones.iter().zip(&other.zones) {
@@ -110,8 +70,8 @@ impl Traffic for Scripted {
         "scripted".to_owned()
     }
 
-    fn brings(&self) -> bool {
-        true
+    fn begin(&mut self, scenario: &Scenario) {
+        self.dt_s = scenario.dt_s();
     }
 
     fn step(
@@ -128,9 +88,8 @@ impl Traffic for Scripted {
             let Some((x_m, v_mps)) = self.here.get_mut(&task.vehicle) else { continue };
             // Whoever is not told drives on, and out of sight at last.
             let u_mps2 = if task.is_held == 1 { task.u_mps2 } else { 0.0 };
-            let held = Held::new(*x_m, *v_mps, u_mps2);
-            *done = Done { advanced_m: held.position_m(self.dt_s) - *x_m, v_mps: held.speed_mps(self.dt_s) };
-            (*x_m, *v_mps) = (held.position_m(self.dt_s), held.speed_mps(self.dt_s));
+            *done = world::moved(*v_mps, u_mps2, self.dt_s);
+            (*x_m, *v_mps) = (*x_m + done.advanced_m, done.v_mps);
             if let Some(said) = self.said {
                 *done = said;
             }
@@ -143,15 +102,10 @@ impl Traffic for Scripted {
         }
         Ok(if self.coming.iter().any(|(when, _)| *when > step) { Coming::More } else { Coming::Nobody })
     }
-
-    fn admit(&mut self, _vehicles: &mut [Admitted]) -> Result<(), TrafficError> {
-        unreachable!("it brings its vehicles itself")
-    }
 }
 
 fn newcomer(path: u32, x_m: f64, v_mps: f64, is_commanded: u32) -> Newcomer {
-    let none = Newcomer::NONE;
-    Newcomer { x_m, v_mps, zone: 0, path, road: none, route: none, kind: 0, is_commanded }
+    Newcomer { x_m, v_mps, path, is_commanded, ..Newcomer::default() }
 }
 
 /// A traffic brings vehicles at the entrance and in the midst of a zone, commanded or not, and takes one out: those on
@@ -160,7 +114,6 @@ fn newcomer(path: u32, x_m: f64, v_mps: f64, is_commanded: u32) -> Newcomer {
 fn who_is_brought_in_and_taken_out_anywhere_is_reckoned_with() {
     let scenario = scenario("intersection", &["end.time_s=120", "shield=on", "coordination.order=fifo"]);
     let traffic = Scripted {
-        dt_s: scenario.dt_s(),
         coming: vec![
             (0, newcomer(0, 0.5, 10.0, 1)),
             // Ahead of the first on its lane, though it comes after it; somebody else drives it.
@@ -194,12 +147,9 @@ fn who_is_brought_in_and_taken_out_anywhere_is_reckoned_with() {
 #[test]
 fn what_cannot_be_is_refused() {
     let intersection = scenario("intersection", &["end.time_s=20"]);
-    let fails = |traffic: Scripted| {
-        let traffic = Box::new(Scripted { dt_s: intersection.dt_s(), ..traffic });
-        match played(&intersection, traffic).unwrap_err() {
-            LockstepError::World { error: error @ AdvanceError::Traffic { .. }, .. } => error.to_string(),
-            other => panic!("{other:?}"),
-        }
+    let fails = |traffic: Scripted| match played(&intersection, Box::new(traffic)).unwrap_err() {
+        LockstepError::World { error: error @ AdvanceError::Traffic { .. }, .. } => error.to_string(),
+        other => panic!("{other:?}"),
     };
     let coming = |newcomer: Newcomer| Scripted { coming: vec![(0, newcomer)], ..Scripted::default() };
     let good = newcomer(0, 0.0, 10.0, 1);

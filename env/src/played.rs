@@ -3,7 +3,7 @@
 //! The callbacks are called in the thread that called [`cz_world_run`], and in no other.
 
 use crate::text;
-use control_zones::scenario::{Override, load};
+use control_zones::scenario::{Override, Scenario, load};
 use control_zones::world::{Admitted, Coming, Done, Newcomer, Task, Traffic, TrafficError};
 use std::ffi::{CString, c_char, c_int, c_void};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -62,6 +62,8 @@ pub struct Callbacks {
     ) -> c_int,
     /// 1 if it brings its vehicles itself.
     pub brings: c_int,
+    /// Told once, before anything else, what is played: the scenario as JSON. May be null.
+    pub begin: Option<unsafe extern "C" fn(context: *mut c_void, scenario: *const c_char)>,
 }
 
 #[derive(Debug)]
@@ -74,6 +76,15 @@ struct Called {
 impl Traffic for Called {
     fn name(&self) -> String {
         self.name.clone()
+    }
+
+    fn begin(&mut self, scenario: &Scenario) {
+        let Callbacks { context, begin: Some(call), .. } = self.callbacks else { return };
+        let Some(json) = serde_json::to_string(scenario).ok().and_then(|json| CString::new(json).ok()) else {
+            return;
+        };
+        // SAFETY: the string ends with a zero, and outlives the call.
+        unsafe { call(context, json.as_ptr()) };
     }
 
     fn brings(&self) -> bool {
@@ -143,18 +154,8 @@ pub unsafe extern "C" fn cz_world_run(
     // SAFETY: as the caller promises.
     let ([name, arguments], callbacks) = unsafe { ([text(name), text(arguments)], *callbacks) };
     let (Some(name), Some(arguments)) = (name, arguments) else { return 2 };
-    let none = Newcomer::NONE;
-    let empty = Newcomer {
-        x_m: 0.0,
-        v_mps: 0.0,
-        zone: 0,
-        path: 0,
-        road: none,
-        route: none,
-        kind: 0,
-        is_commanded: 0,
-    };
-    let called = Called { name: name.into_owned(), callbacks, newcomers: vec![empty; MOST_NEWCOMERS] };
+    let called =
+        Called { name: name.into_owned(), callbacks, newcomers: vec![Newcomer::default(); MOST_NEWCOMERS] };
     let arguments: Vec<String> = arguments.lines().map(str::to_owned).collect();
     let run = || control_zones::app::played(&arguments, Box::new(called));
     catch_unwind(AssertUnwindSafe(run)).map_or(1, c_int::from)

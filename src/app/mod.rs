@@ -25,6 +25,7 @@ mod sdk;
 mod show;
 mod sibling;
 mod supervise;
+mod world;
 
 #[cfg(fuzzing)]
 pub use show::everything as show_everything;
@@ -137,7 +138,8 @@ pub fn cz() -> ExitCode {
         "cz",
         match args.command {
             args::Command::Run(args) => run::run(&args, None),
-            args::Command::World(args) => parts::world(&args, None),
+            args::Command::World(args::WorldOrCheck::World(args)) => parts::world(&args, None),
+            args::Command::World(args::WorldOrCheck::Check(args)) => world::check(&args),
             args::Command::Coord(args) => parts::coordinator(&args),
             args::Command::Ctrl(args) => parts::controller(&args),
             args::Command::Keep(args) => supervise::keep(&args),
@@ -186,7 +188,7 @@ pub fn played(arguments: &[String], traffic: Box<dyn Traffic>) -> u8 {
     };
     let result = match args.command {
         args::Command::Run(args) if args.in_process => run::run(&args, Some(traffic)),
-        args::Command::World(args) => parts::world(&args, Some(traffic)),
+        args::Command::World(args::WorldOrCheck::World(args)) => parts::world(&args, Some(traffic)),
         _ => Err(AppError::Usage("expected `run --in-process` or `world`, with their arguments".to_owned())),
     };
     exit_code(&name, result)

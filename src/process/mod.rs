@@ -22,6 +22,7 @@ mod viewing;
 mod wait;
 mod wait_policy;
 mod world;
+mod world_check;
 
 pub use attach::{Attachment, Joining};
 pub use observe::{Observation, RecordLag};
@@ -44,6 +45,9 @@ pub use wait::{Patience, WaitMode, Waiter};
 pub use world::{
     Departure, WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process,
     run_in_process_observed, run_on_in_process, run_on_in_process_observed, run_world,
+};
+pub use world_check::{
+    CHANGES, Tolerances, WorldBreach, WorldCheckOptions, WorldReport, WorldRule, check_world,
 };
 
 use crate::lockstep::LockstepError;
@@ -164,4 +168,12 @@ pub enum ProcessError {
     /// Signal handlers could not be installed.
     #[error("cannot handle signals: {0}")]
     Signals(std::io::Error),
+    /// A folder for a check's files could not be made.
+    #[error("cannot make {}: {error}", .path.display())]
+    Folder {
+        /// Where.
+        path: std::path::PathBuf,
+        /// Why.
+        error: std::io::Error,
+    },
 }

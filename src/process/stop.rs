@@ -41,6 +41,11 @@ impl StopFlag {
         Ok(flag)
     }
 
+    /// Has whoever looks at it stop.
+    pub fn set(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
     /// Whether to stop.
     pub fn is_set(&self) -> bool {
         self.0.load(Ordering::Relaxed)

@@ -69,6 +69,14 @@ impl Newcomer {
     pub const NONE: u32 = NONE;
 }
 
+impl Default for Newcomer {
+    /// At the origin of the first path of the first zone, at a standstill, commanded, on no road's route.
+    fn default() -> Newcomer {
+        let (road, route) = (NONE, NONE);
+        Newcomer { x_m: 0.0, v_mps: 0.0, zone: 0, path: 0, road, route, kind: 0, is_commanded: 1 }
+    }
+}
+
 /// A vehicle that the world's own gates have let in, to be put where it is at the end of the step.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Admitted {
@@ -107,9 +115,14 @@ pub trait Traffic: std::fmt::Debug {
     /// What it is called in reports.
     fn name(&self) -> String;
 
-    /// Whether it brings its vehicles itself; otherwise the world's roads do, and it is told by
-    /// [`admit`](Self::admit).
-    fn brings(&self) -> bool;
+    /// Told once, before anything else, what is played.
+    fn begin(&mut self, _scenario: &Scenario) {}
+
+    /// Whether it brings its vehicles itself, as it does unless it says otherwise; otherwise the world's roads do, and it is
+    /// told by [`admit`](Self::admit).
+    fn brings(&self) -> bool {
+        true
+    }
 
     /// Makes one step. There is a `done` for each of the `tasks`, which are in order of vehicle; those who came during the
     /// step go to `newcomers`.
@@ -125,11 +138,13 @@ pub trait Traffic: std::fmt::Debug {
     ) -> Result<Coming, TrafficError>;
 
     /// Puts vehicles where the world's gates have let them in, at the end of the step just made, and says which of them
-    /// are not commanded.
+    /// are not commanded. Nobody is let in where it brings its vehicles itself.
     ///
     /// # Errors
     /// When it cannot; the run fails.
-    fn admit(&mut self, vehicles: &mut [Admitted]) -> Result<(), TrafficError>;
+    fn admit(&mut self, _vehicles: &mut [Admitted]) -> Result<(), TrafficError> {
+        Ok(())
+    }
 }
 
 /// Why the world cannot go on to the next step.
@@ -183,6 +198,8 @@ pub(super) struct Played {
 const OUT_OF_SIGHT_M: f64 = 1e6;
 /// A vehicle that comes back so little, m, has not: rounding.
 const BACK_M: f64 = 1e-6;
+/// One that begins a step so slowly backwards, m/s, starts from a standstill: rounding.
+const ROUNDING_MPS: f64 = 1e-6;
 
 impl Played {
     fn failed(&self, problem: String) -> AdvanceError {
@@ -218,8 +235,8 @@ impl Played {
         }
         let mean_mps = done.advanced_m / dt_s;
         let began_mps = 2.0 * mean_mps - done.v_mps;
-        (car.v_mps, car.command_mps2) = match began_mps >= 0.0 {
-            true => (began_mps, (done.v_mps - began_mps) / dt_s),
+        (car.v_mps, car.command_mps2) = match began_mps >= -ROUNDING_MPS {
+            true => (began_mps.max(0.0), (done.v_mps - began_mps.max(0.0)) / dt_s),
             // Stops and starts within a step: what counts is where it ends.
             false => (mean_mps, 0.0),
         };
@@ -229,7 +246,8 @@ impl Played {
 
 impl World {
     /// A world at step 0 whose vehicles a traffic moves.
-    pub fn played(scenario: Arc<Scenario>, coordinators: u32, traffic: Box<dyn Traffic>) -> World {
+    pub fn played(scenario: Arc<Scenario>, coordinators: u32, mut traffic: Box<dyn Traffic>) -> World {
+        traffic.begin(&scenario);
         let mut world = World::new(scenario, coordinators);
         // Its humans are its own.
         world.humans = None;

@@ -84,6 +84,9 @@ class Traffic:
     #: Whether it brings its vehicles itself; otherwise the scenario's roads do, and `admit` tells of them.
     brings: bool = True
 
+    def begin(self, scenario: dict[str, typing.Any]) -> None:
+        """Told once, before anything else, what is played: the scenario as `describe` has it, `dt_ns` among it."""
+
     def step(self, step: int, tasks: Sequence[tuple[float, int, int]]) -> tuple[Iterable[float], Sequence[Newcomer], bool]:
         """Makes one step.
 
@@ -109,10 +112,17 @@ _STEP = ctypes.CFUNCTYPE(
     ctypes.POINTER(ctypes.c_uint32),
 )
 _ADMIT = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_void_p)
+_BEGIN = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_char_p)
 
 
 class _Callbacks(ctypes.Structure):
-    _fields_ = [("context", ctypes.c_void_p), ("step", _STEP), ("admit", _ADMIT), ("brings", ctypes.c_int)]
+    _fields_ = [
+        ("context", ctypes.c_void_p),
+        ("step", _STEP),
+        ("admit", _ADMIT),
+        ("brings", ctypes.c_int),
+        ("begin", _BEGIN),
+    ]
 
 
 def run(traffic: Traffic, arguments: Sequence[str]) -> int:
@@ -124,9 +134,17 @@ def run(traffic: Traffic, arguments: Sequence[str]) -> int:
     raised: list[BaseException] = []
     waiting: list[Newcomer] = []
 
+    def begin(_: object, scenario: bytes) -> None:
+        try:
+            traffic.begin(json.loads(scenario))
+        except BaseException as error:  # noqa: BLE001 - the first step says so
+            raised.append(error)
+
     def step(
         _: object, number: int, count: int, tasks: int, done: int, room: int, newcomers: int, came: typing.Any
     ) -> int:
+        if raised:
+            return -1
         try:
             told = ctypes.string_at(tasks, count * _TASK.size) if count else b""
             did, new, comes = traffic.step(number, list(_TASK.iter_unpack(told)))
@@ -164,7 +182,9 @@ def run(traffic: Traffic, arguments: Sequence[str]) -> int:
         raise Error("an argument has a line break in it")
     library.cz_world_run.restype = ctypes.c_int
     library.cz_world_run.argtypes = [ctypes.c_char_p, ctypes.c_char_p, ctypes.POINTER(_Callbacks)]
-    callbacks = _Callbacks(None, _STEP(step), _ADMIT(admit), int(traffic.brings))
+    # Who does not ask what is played is not told: of a great network that is a long text.
+    wants = type(traffic).begin is not Traffic.begin
+    callbacks = _Callbacks(None, _STEP(step), _ADMIT(admit), int(traffic.brings), _BEGIN(begin if wants else 0))
     lines = "\n".join(arguments).encode()
     code = int(library.cz_world_run(traffic.name.encode(), lines, ctypes.byref(callbacks)))
     if raised:

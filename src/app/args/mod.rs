@@ -13,7 +13,7 @@ pub(super) use bench::{BenchArgs, BenchKind, MeasureArgs, PeerArgs, ViewBenchArg
 use clap::{Args, Parser, Subcommand};
 pub(super) use conduct::{ConductArgs, Restart, ShareArgs, SteeringArgs, TimingArgs, WaitArgs};
 pub(super) use record::{BranchArgs, ReplayArgs, ResumeArgs, ShowArgs, VerifyArgs};
-pub(super) use run::{KeepArgs, PartArgs, RunArgs, SupervisedArgs, WorldArgs};
+pub(super) use run::{KeepArgs, PartArgs, RunArgs, SupervisedArgs, WorldArgs, WorldCheckArgs, WorldOrCheck};
 pub(super) use scenario::{ScenarioArgs, SideBySide};
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -33,8 +33,8 @@ pub(super) struct Cz {
 pub(super) enum Command {
     /// Run a scenario: start all processes, show progress, print the results.
     Run(RunArgs),
-    /// Start only the world of a run (the same as the program cz-world).
-    World(WorldArgs),
+    /// Start only the world of a run (the same as the program cz-world); or check one of your own.
+    World(WorldOrCheck),
     /// Start only a coordinator of a run (the same as the program cz-coord).
     Coord(PartArgs),
     /// Start only a controller of a run (the same as the program cz-ctrl).

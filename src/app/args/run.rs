@@ -2,7 +2,7 @@
 
 use super::{ConductArgs, ScenarioArgs, ShareArgs, WaitArgs};
 use crate::transport::iox::RunName;
-use clap::Args;
+use clap::{ArgMatches, Args, FromArgMatches, Subcommand};
 use std::path::PathBuf;
 
 #[derive(Debug, Args)]
@@ -102,6 +102,72 @@ pub(in crate::app) struct WorldArgs {
     /// Process id of the supervisor: report to it on stdout, and end with it.
     #[arg(long, hide = true, value_name = "PID")]
     pub supervised: Option<u32>,
+}
+
+#[derive(Debug, Subcommand)]
+enum WorldCommand {
+    /// Start a world of your own between a coordinator and a scripted controller and report, rule by rule, whether it
+    /// keeps the contract (docs/world-contract.md).
+    Check(WorldCheckArgs),
+}
+
+/// `cz world` with its own arguments, or `cz world check`, which asks for none of them.
+#[derive(Debug)]
+pub(in crate::app) enum WorldOrCheck {
+    World(Box<WorldArgs>),
+    Check(WorldCheckArgs),
+}
+
+impl FromArgMatches for WorldOrCheck {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<WorldOrCheck, clap::Error> {
+        match matches.subcommand() {
+            Some(_) => WorldCommand::from_arg_matches(matches)
+                .map(|WorldCommand::Check(args)| WorldOrCheck::Check(args)),
+            None => WorldArgs::from_arg_matches(matches).map(|args| WorldOrCheck::World(Box::new(args))),
+        }
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = WorldOrCheck::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+impl Args for WorldOrCheck {
+    fn augment_args(command: clap::Command) -> clap::Command {
+        let command = WorldCommand::augment_subcommands(WorldArgs::augment_args(command));
+        command.subcommand_required(false).args_conflicts_with_subcommands(true).subcommand_negates_reqs(true)
+    }
+
+    fn augment_args_for_update(command: clap::Command) -> clap::Command {
+        WorldOrCheck::augment_args(command)
+    }
+}
+
+#[derive(Debug, Args)]
+pub(in crate::app) struct WorldCheckArgs {
+    /// The scenario it plays; the check turns the shield off, lets nobody in where there is no room, and ends after 80 s.
+    #[command(flatten)]
+    pub scenario: ScenarioArgs,
+    /// How far an acceleration may be from the one that was to be held, m/s^2.
+    #[arg(long, value_name = "MPS2", default_value_t = 0.01)]
+    pub tolerance: f64,
+    /// How far a way may be from the one that goes with the speeds at its ends, m.
+    #[arg(long, value_name = "M", default_value_t = 0.005)]
+    pub way_tolerance: f64,
+    /// How long it may take to open the run, to make a step, and to end, s.
+    #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
+    pub patience: f64,
+    /// Breaches of this rule are told of, and do not count, e.g. `--allow kept` where vehicles change lanes out of a
+    /// zone; may be repeated.
+    #[arg(long, value_name = "RULE")]
+    pub allow: Vec<String>,
+    /// Print JSON.
+    #[arg(long)]
+    pub json: bool,
+    /// The world's command line, after `--`; the arguments of `cz world` are added to it.
+    #[arg(last = true, required = true, value_name = "COMMAND")]
+    pub command: Vec<String>,
 }
 
 #[derive(Debug, Args)]
