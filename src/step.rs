@@ -2,7 +2,7 @@
 //!
 //! The step protocol shows them to whoever looks on; recordings hold them. Neither needs to know the other.
 
-use ipc_schemas::{Assignment, FrameHeader, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{Assignment, Feedback, FrameHeader, VehicleCommand, VehicleState, ZoneSummary};
 
 /// [`StepFrames::policy`]: nobody missed the step, or nothing was put in anybody's place.
 pub const POLICY_NONE: u32 = 0;
@@ -24,6 +24,8 @@ pub struct StepFrames<'a> {
     /// Commands as they were handed to the gateway, one part per controller process in order of index; none
     /// in the last step of a run.
     pub commands: &'a [CommandPart<'a>],
+    /// What controllers written elsewhere were told since the state before: of their last commands, and of frames refused.
+    pub feedback: &'a [Feedback],
     /// Bit `i`: controller `i` did not answer in time, and its part is what the world put in its place.
     pub misses: u64,
     /// How the world chose that: a code of the world's; [`POLICY_NONE`] where there are no misses.
@@ -54,6 +56,8 @@ pub struct Step {
     pub coordination: Vec<Assignment>,
     /// Commands per controller process.
     pub commands: Vec<Commands>,
+    /// What controllers written elsewhere were told since the state before.
+    pub feedback: Vec<Feedback>,
     /// Controllers in whose place the world decided, one bit each.
     pub misses: u64,
     /// How it did.

@@ -389,6 +389,77 @@ fn names_of_code_are_in_the_code() {
     assert!(wrong.is_empty(), "documents name what is not in the code:\n{}", wrong.join("\n"));
 }
 
+/// What may stand in the table of views beside names of a package: what the language has by itself.
+const OF_THE_LANGUAGE: [&str; 4] = ["str", "to_string", "True", "None"];
+
+/// What stands between neither of two marks.
+fn outside(text: &str, begins: &str, ends: &str) -> String {
+    let mut parts = text.split(begins);
+    let first = parts.next().unwrap_or_default().to_owned();
+    parts.fold(first, |all, part| all + part.split_once(ends).map_or("", |(_, rest)| rest))
+}
+
+/// The names in lines of sources that begin with one of these words, without remarks: these declare nothing.
+fn declared(paths: &[String], words: &[&str]) -> BTreeSet<String> {
+    let mut known = BTreeSet::new();
+    for path in paths {
+        let text = std::fs::read_to_string(root().join(path)).unwrap();
+        let text = match path.ends_with(".py") {
+            true => text.split("\"\"\"").step_by(2).collect::<Vec<_>>().concat(),
+            false => outside(&text, "/*", "*/"),
+        };
+        let mark = if path.ends_with(".py") { "#" } else { "//" };
+        let lines = text.lines().map(|line| line.split(mark).next().unwrap_or_default().trim_start());
+        let lines = lines.filter(|line| words.iter().any(|word| line.starts_with(word)));
+        lines.for_each(|line| known.extend(names(line).map(str::to_owned)));
+    }
+    known
+}
+
+#[test]
+fn names_of_the_view_are_in_the_package_of_their_language() {
+    let text = std::fs::read_to_string(root().join("docs/plugins.md")).unwrap();
+    let rows = text.lines().skip_while(|line| !line.starts_with("| | Python")).skip(2);
+    let rows: Vec<&str> = rows.take_while(|line| line.starts_with('|')).collect();
+    assert!(rows.len() > 8, "the table of views is not where it was");
+    let of = |folder: &str, files: &[&str]| {
+        files.iter().map(|file| format!("{folder}/{file}")).collect::<Vec<String>>()
+    };
+    let python = of("sdk/python/control_zones", &["_view.py", "_session.py", "_schemas.py"]);
+    let rust = of("sdk/rust/src", &["lib.rs", "view.rs"]);
+    let rust = [rust, of("ipc_schemas/src", &["feedback.rs", "state.rs"])].concat();
+    let c = of("sdk/include/control_zones", &["plugin.h", "plugin.hpp"]);
+    let c = [c, of("ipc_schemas/include", &["cz_schemas.h"])].concat();
+    let packages = [
+        ("Python", declared(&python, &[""])),
+        ("Rust", declared(&rust, &["pub ", "fn "])),
+        ("C and C++", declared(&c, &[""])),
+    ];
+    let (mut wrong, mut seen) = (Vec::new(), 0);
+    for row in rows {
+        let cells: Vec<&str> = row.trim_matches('|').split('|').collect();
+        assert_eq!(cells.len(), 4, "{row}");
+        // What the row says by itself goes for all of them.
+        for (cell, (language, known)) in cells[1..].iter().zip(&packages) {
+            for span in cell.split('`').skip(1).step_by(2).chain(cells[0].split('`').skip(1).step_by(2)) {
+                // What a thing is called in the example is the reader's.
+                let mine =
+                    ["vehicle", "step", "state", "i", "k", "controller", "partner", "partners", "summary"];
+                for name in names(span).filter(|name| !OF_THE_LANGUAGE.contains(name)) {
+                    let is_mine = mine.contains(&name) && span.contains(['.', '[', '(']);
+                    seen += 1;
+                    let code = format!("CZ_{name}");
+                    if !(is_mine || known.contains(name) || known.contains(&code)) {
+                        wrong.push(format!("{language}: `{name}` of `{span}`"));
+                    }
+                }
+            }
+        }
+    }
+    assert!(seen > 80, "only {seen} names were found: is this test blind?");
+    assert!(wrong.is_empty(), "the table of views names what a package has not:\n{}", wrong.join("\n"));
+}
+
 #[test]
 fn the_map_from_equations_to_code_is_the_present_one() {
     let text = std::fs::read_to_string(root().join("docs/reproduction.md")).unwrap();

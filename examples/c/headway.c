@@ -1,30 +1,20 @@
-/*
- * Constant time headway: follow whoever is ahead, or merges ahead, at phi seconds plus a gap; go for the
- * terminal speed otherwise.
- *
- *     cz sdk install --prefix sdk-prefix
- *     cc headway.c $(PKG_CONFIG_PATH=sdk-prefix/lib/pkgconfig pkg-config --cflags --libs control-zones) -lm
- */
+/* Constant time headway: goes for the terminal speed, and keeps its distance to all it must respect. */
 #include <control_zones/plugin.h>
 #include <math.h>
 #include <stdio.h>
 
-static double clamp(double u, double low, double high) { return fmax(low, fmin(u, high)); }
-
-/* Acceleration toward a headway of phi seconds behind a vehicle at x going v. */
-static double follow(const cz_run_spec_t *spec, const cz_vehicle_state_t *self, double x, double v) {
-    double gap = x - self->x_m - spec->standstill_gap_m - 2.0;
-    double wanted = spec->reaction_time_s * self->v_mps;
-    return 0.4 * (gap - wanted) + 1.2 * (v - self->v_mps);
-}
-
-static double drive(const cz_run_spec_t *spec, const cz_vehicle_t *vehicle) {
-    const cz_vehicle_state_t *self = vehicle->state;
-    double speed = isnan(vehicle->terminal_mps) ? 18.0 : vehicle->terminal_mps;
-    double u = 0.6 * (speed - self->v_mps);
-    if (vehicle->ahead) u = fmin(u, follow(spec, self, vehicle->ahead_x_m, vehicle->ahead->v_mps));
-    if (vehicle->merge) u = fmin(u, follow(spec, self, vehicle->merge_x_m, vehicle->merge->v_mps));
-    return clamp(u, spec->u_min_mps2, spec->u_max_mps2);
+/* One acceleration, m/s^2, for the vehicle at this place among those to be commanded. */
+static double decide(const cz_plugin_t *plugin, const cz_vehicle_t *vehicle, size_t place) {
+    const cz_run_spec_t *spec = cz_run_spec(plugin);
+    double x = vehicle->state->x_m, v = vehicle->state->v_mps;
+    double u = 0.6 * ((isnan(vehicle->terminal_mps) ? 18.0 : vehicle->terminal_mps) - v);
+    size_t count;
+    const cz_partner_t *partners = cz_partners(plugin, place, &count);
+    for (size_t i = 0; i < count; i++) {
+        double gap = partners[i].x_m - x - partners[i].gap_m - spec->reaction_time_s * v;
+        u = fmin(u, 0.4 * gap + 1.2 * (partners[i].state->v_mps - v));
+    }
+    return fmax(spec->u_min_mps2, fmin(u, spec->u_max_mps2));
 }
 
 int main(void) {
@@ -36,12 +26,16 @@ int main(void) {
         size_t count;
         const cz_vehicle_t *vehicles = cz_vehicles(plugin, &count);
         cz_vehicle_command_t *commands = cz_commands(plugin, &count);
-        for (size_t i = 0; i < count; i++) {
-            commands[i].u_mps2 = drive(cz_run_spec(plugin), &vehicles[i]);
-        }
+        for (size_t i = 0; i < count; i++) commands[i].u_mps2 = decide(plugin, &vehicles[i], i);
         if (cz_send(plugin) != 0) wake = CZ_ERROR;
     }
-    if (wake == CZ_ERROR) fprintf(stderr, "%s\n", cz_last_error());
+    if (wake == CZ_ERROR) {
+        fprintf(stderr, "%s\n", cz_last_error());
+    } else {
+        cz_summary_t summary = cz_summary(plugin);
+        printf("%llu steps answered, %llu passed without this controller\n",
+               (unsigned long long)summary.answered, (unsigned long long)summary.skipped);
+    }
     cz_detach(plugin);
     return wake == CZ_END ? 0 : 1;
 }

@@ -31,7 +31,7 @@
 #endif
 
 /* Hash of all record layouts: what the fields named schema_hash carry. */
-#define CZ_SCHEMA_HASH UINT64_C(0xf214663ee06bf4cd)
+#define CZ_SCHEMA_HASH UINT64_C(0x817d84fa9a9ed0eb)
 
 /** `cz_frame_header_t.sender_role`: the world integrator. */
 #define CZ_ROLE_WORLD UINT16_C(1)
@@ -119,6 +119,64 @@
  *  held as far as the shield allows. */
 #define CZ_VERDICT_FALLBACK UINT16_C(5)
 
+/** `cz_feedback_t.row`: nothing of the shield's; the record is about a frame that was refused. */
+#define CZ_ROW_NONE UINT16_C(0)
+/** `cz_feedback_t.row`: the greatest speed of the vehicle. */
+#define CZ_ROW_SPEED UINT16_C(1)
+/** `cz_feedback_t.row`: the margin toward a vehicle ahead. */
+#define CZ_ROW_REAR_END UINT16_C(2)
+/** `cz_feedback_t.row`: the margin toward a vehicle that passes a merge first. */
+#define CZ_ROW_MERGE UINT16_C(3)
+/** `cz_feedback_t.row`: the margin toward a vehicle that crosses first. */
+#define CZ_ROW_CROSS UINT16_C(4)
+/** `cz_feedback_t.row`: the command was not within the vehicle's limits, or no number. */
+#define CZ_ROW_LIMITS UINT16_C(5)
+/** `cz_feedback_t.rule`: no frame was refused; the record is about the shield. */
+#define CZ_RULE_NONE UINT16_C(0)
+/** `cz_feedback_t.rule`: not within the limits. */
+#define CZ_RULE_LIMITS UINT16_C(1)
+/** `cz_feedback_t.rule`: no number. */
+#define CZ_RULE_NOT_FINITE UINT16_C(2)
+/** `cz_feedback_t.rule`: another value than the only one there can be. */
+#define CZ_RULE_OTHER UINT16_C(3)
+/** `cz_feedback_t.rule`: the vehicle is in no zone. */
+#define CZ_RULE_UNKNOWN UINT16_C(4)
+/** `cz_feedback_t.rule`: another controller drives the vehicle. */
+#define CZ_RULE_FOREIGN UINT16_C(5)
+/** `cz_feedback_t.rule`: the vehicle is commanded twice. */
+#define CZ_RULE_TWICE UINT16_C(6)
+/** `cz_feedback_t.rule`: the vehicle has no command at its place in the frame. */
+#define CZ_RULE_MISSING UINT16_C(7)
+/** `cz_feedback_t.rule`: nobody asked for an answer to the step. */
+#define CZ_RULE_UNASKED UINT16_C(8)
+/** `cz_feedback_t.field`: none; the record is about the shield. */
+#define CZ_FIELD_NONE UINT16_C(0)
+/** `cz_feedback_t.field`: `u_mps2` of a command. */
+#define CZ_FIELD_U_MPS2 UINT16_C(1)
+/** `cz_feedback_t.field`: `planned_exit_time_s` of a command. */
+#define CZ_FIELD_PLANNED_EXIT_TIME_S UINT16_C(2)
+/** `cz_feedback_t.field`: `planned_exit_speed_mps` of a command. */
+#define CZ_FIELD_PLANNED_EXIT_SPEED_MPS UINT16_C(3)
+/** `cz_feedback_t.field`: `vehicle` of a command. */
+#define CZ_FIELD_VEHICLE UINT16_C(4)
+/** `cz_feedback_t.field`: `zone` of a command. */
+#define CZ_FIELD_ZONE UINT16_C(5)
+/** `cz_feedback_t.field`: `verdict` of a command. */
+#define CZ_FIELD_VERDICT UINT16_C(6)
+/** `cz_feedback_t.field`: `step` of the header. */
+#define CZ_FIELD_STEP UINT16_C(7)
+/** `cz_feedback_t.field`: `record_count` of the header. */
+#define CZ_FIELD_RECORD_COUNT UINT16_C(8)
+/** `cz_feedback_t.field`: `generation` of the header. */
+#define CZ_FIELD_GENERATION UINT16_C(9)
+/** `cz_feedback_t.field`: `run_id` of the header; its values do not stand here. */
+#define CZ_FIELD_RUN_ID UINT16_C(10)
+/** `cz_feedback_t.field`: `schema_hash` of the header; its values do not stand here. */
+#define CZ_FIELD_SCHEMA_HASH UINT16_C(11)
+/** `cz_feedback_t.field`: `sender_role` or `sender_index` of the header; their values do not stand
+ *  here. */
+#define CZ_FIELD_SENDER UINT16_C(12)
+
 /** `cz_attach_request_t.controller`: a process of the built-in pool, or a coordinator. */
 #define CZ_BUILT_IN UINT64_C(0)
 /** `cz_attach_request_t.wanted_index`: any free index will do. */
@@ -194,6 +252,9 @@
 #define CZ_SERVICE_SUMMARY_PREFIX "cz/summary/"
 /** Controllers -> world: `cz_vehicle_command_t` of every step. */
 #define CZ_SERVICE_COMMAND "cz/command"
+/** World -> controller `i`, where it is one written elsewhere: `cz_feedback_t`, where there is
+ *  something to say; `i` is appended. */
+#define CZ_SERVICE_FEEDBACK_PREFIX "cz/feedback/"
 /** World -> coordinators and controllers: `cz_member_t`, who has which place. Overflows: only the
  *  last frame counts. */
 #define CZ_SERVICE_MEMBERS "cz/members"
@@ -211,6 +272,7 @@
 #define CZ_TYPE_NAME_ASSIGNMENT "cz.Assignment.v3"
 #define CZ_TYPE_NAME_ZONE_SUMMARY "cz.ZoneSummary.v2"
 #define CZ_TYPE_NAME_VEHICLE_COMMAND "cz.VehicleCommand.v2"
+#define CZ_TYPE_NAME_FEEDBACK "cz.Feedback.v1"
 #define CZ_TYPE_NAME_MEMBER "cz.Member.v1"
 #define CZ_TYPE_NAME_ATTACH_REQUEST "cz.AttachRequest.v1"
 #define CZ_TYPE_NAME_ATTACH_REPLY "cz.AttachReply.v1"
@@ -510,6 +572,54 @@ CZ_ASSERT_(vehicle_command_zone_offset, offsetof(cz_vehicle_command_t, zone) == 
 CZ_ASSERT_(vehicle_command_binding_rows_offset, offsetof(cz_vehicle_command_t, binding_rows) == 96);
 CZ_ASSERT_(vehicle_command_mode_offset, offsetof(cz_vehicle_command_t, mode) == 100);
 CZ_ASSERT_(vehicle_command_verdict_offset, offsetof(cz_vehicle_command_t, verdict) == 102);
+
+/** What became of a command, or why a frame of commands was not taken.
+ *
+ *  Where `row` is not 0: what the shield found of a vehicle's command, the last word on it where
+ *  there were several. Where `rule` is not 0: why a frame was refused, by the first record at
+ *  fault. A frame of the first comes before the state of the step after the command, and only where
+ *  there is something to say; one of the second at once. */
+typedef struct cz_feedback {
+    /** `row`: what was to be applied, m/s^2. `rule`: what the field held (0 where it is no number). */
+    double value;
+    /** The least that was allowed. */
+    double least;
+    /** The greatest that was allowed; the shield's, where `row` says so. What was applied is
+     *  `u_mps2` of the state: with the shield only observing, this is not. */
+    double greatest;
+    /** Step of the command. */
+    uint64_t step;
+    /** The vehicle, or `CZ_NO_VEHICLE`. */
+    uint32_t vehicle;
+    /** Its zone, or `CZ_NO_ZONE`. */
+    uint32_t zone;
+    /** `row`: the vehicle toward which, or `CZ_NO_VEHICLE`. */
+    uint32_t toward;
+    /** `rule`: place in the frame of the record at fault. */
+    uint32_t record;
+    /** Index of the controller that sent the command. */
+    uint16_t controller;
+    /** What of the shield bounded the command: 1 speed, 2 rear end, 3 merge, 4 cross, 5 limits. */
+    uint16_t row;
+    /** What the frame broke. */
+    uint16_t rule;
+    /** The field that did. */
+    uint16_t field;
+} cz_feedback_t;
+CZ_ASSERT_(feedback_size, sizeof(cz_feedback_t) == 56);
+CZ_ASSERT_ALIGN_(cz_feedback_t, 8);
+CZ_ASSERT_(feedback_value_offset, offsetof(cz_feedback_t, value) == 0);
+CZ_ASSERT_(feedback_least_offset, offsetof(cz_feedback_t, least) == 8);
+CZ_ASSERT_(feedback_greatest_offset, offsetof(cz_feedback_t, greatest) == 16);
+CZ_ASSERT_(feedback_step_offset, offsetof(cz_feedback_t, step) == 24);
+CZ_ASSERT_(feedback_vehicle_offset, offsetof(cz_feedback_t, vehicle) == 32);
+CZ_ASSERT_(feedback_zone_offset, offsetof(cz_feedback_t, zone) == 36);
+CZ_ASSERT_(feedback_toward_offset, offsetof(cz_feedback_t, toward) == 40);
+CZ_ASSERT_(feedback_record_offset, offsetof(cz_feedback_t, record) == 44);
+CZ_ASSERT_(feedback_controller_offset, offsetof(cz_feedback_t, controller) == 48);
+CZ_ASSERT_(feedback_row_offset, offsetof(cz_feedback_t, row) == 50);
+CZ_ASSERT_(feedback_rule_offset, offsetof(cz_feedback_t, rule) == 52);
+CZ_ASSERT_(feedback_field_offset, offsetof(cz_feedback_t, field) == 54);
 
 /** World -> coordinators and controllers: the process that has a place in the run.
  *

@@ -10,6 +10,7 @@ pub mod check;
 pub mod code;
 mod command;
 mod coordination;
+mod feedback;
 pub mod generate;
 mod header;
 mod member;
@@ -24,6 +25,7 @@ pub use check::{ExpectedHeader, HeaderFault};
 pub use code::{Code, CodeValue};
 pub use command::*;
 pub use coordination::*;
+pub use feedback::*;
 pub use header::*;
 pub use member::*;
 pub use record::{Field, Layout, Record, Scalar, bytes_of, records_from};
@@ -39,12 +41,13 @@ pub const C_HEADER: &str = include_str!("../include/cz_schemas.h");
 compile_error!("frames are little-endian and are used in place");
 
 /// The layouts of all record types, in the order the schema hash covers them.
-pub const LAYOUTS: [Layout; 11] = [
+pub const LAYOUTS: [Layout; 12] = [
     FrameHeader::LAYOUT,
     VehicleState::LAYOUT,
     Assignment::LAYOUT,
     ZoneSummary::LAYOUT,
     VehicleCommand::LAYOUT,
+    Feedback::LAYOUT,
     Member::LAYOUT,
     AttachRequest::LAYOUT,
     AttachReply::LAYOUT,
@@ -57,12 +60,13 @@ pub const LAYOUTS: [Layout; 11] = [
 ///
 /// Not part of the schema hash: a new code does not change a layout. Changing the meaning of an old one
 /// is a new version of the record that carries it.
-pub const CODES: [&[Code]; 8] = [
+pub const CODES: [&[Code]; 9] = [
     header::CODES,
     state::CODES,
     coordination::CODES,
     summary::CODES,
     command::CODES,
+    feedback::CODES,
     attach::CODES,
     run_spec::CODES,
     services::CODES,

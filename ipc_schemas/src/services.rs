@@ -14,6 +14,9 @@ codes! {
     pub const SERVICE_SUMMARY_PREFIX: &str = "cz/summary/";
     /// Controllers → world: [`VehicleCommand`](crate::VehicleCommand) of every step.
     pub const SERVICE_COMMAND: &str = "cz/command";
+    /// World → controller `i`, where it is one written elsewhere: [`Feedback`](crate::Feedback), where there is something to
+    /// say; `i` is appended.
+    pub const SERVICE_FEEDBACK_PREFIX: &str = "cz/feedback/";
     /// World → coordinators and controllers: [`Member`](crate::Member), who has which place. Overflows: only
     /// the last frame counts.
     pub const SERVICE_MEMBERS: &str = "cz/members";

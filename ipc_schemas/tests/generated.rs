@@ -7,8 +7,9 @@ use std::process::{Command, Stdio};
 
 use iceoryx2_bb_elementary_traits::zero_copy_send::ZeroCopySend;
 use ipc_schemas::{
-    Assignment, AttachReply, AttachRequest, CODES, CodeValue, FrameHeader, KindSpec, LAYOUTS, Member,
-    PathSpec, Role, RunSpec, VehicleCommand, VehicleState, ZoneSummary, generate, schema_hash, schema_text,
+    Assignment, AttachReply, AttachRequest, CODES, CodeValue, Feedback, FrameHeader, KindSpec, LAYOUTS,
+    Member, PathSpec, Role, RunSpec, VehicleCommand, VehicleState, ZoneSummary, generate, schema_hash,
+    schema_text,
 };
 
 /// Type name, size, and the fields with their scalar types and offsets.
@@ -16,7 +17,7 @@ type Golden = (&'static str, usize, &'static [(&'static str, &'static str, usize
 
 /// The layouts of version 1, written out by hand. A change here breaks every program that was built
 /// with the old frames: give the record a new version in its type name instead.
-const GOLDEN: [Golden; 11] = [
+const GOLDEN: [Golden; 12] = [
     (
         "cz.FrameHeader.v1",
         64,
@@ -121,6 +122,24 @@ const GOLDEN: [Golden; 11] = [
         ],
     ),
     (
+        "cz.Feedback.v1",
+        56,
+        &[
+            ("value", "f64", 0),
+            ("least", "f64", 8),
+            ("greatest", "f64", 16),
+            ("step", "u64", 24),
+            ("vehicle", "u32", 32),
+            ("zone", "u32", 36),
+            ("toward", "u32", 40),
+            ("record", "u32", 44),
+            ("controller", "u16", 48),
+            ("row", "u16", 50),
+            ("rule", "u16", 52),
+            ("field", "u16", 54),
+        ],
+    ),
+    (
         "cz.Member.v1",
         12,
         &[("process_id", "u32", 0), ("generation", "u32", 4), ("role", "u16", 8), ("index", "u16", 10)],
@@ -219,7 +238,7 @@ const GOLDEN: [Golden; 11] = [
 ];
 
 /// XXH3-64 of the schema text of [`GOLDEN`].
-const GOLDEN_HASH: u64 = 0xf214_663e_e06b_f4cd;
+const GOLDEN_HASH: u64 = 0x817d_84fa_9a9e_d0eb;
 
 fn crate_dir() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -311,6 +330,7 @@ fn the_transport_registers_the_same_type_names() {
             Assignment::type_name(),
             ZoneSummary::type_name(),
             VehicleCommand::type_name(),
+            Feedback::type_name(),
             Member::type_name(),
             AttachRequest::type_name(),
             AttachReply::type_name(),

@@ -41,7 +41,7 @@ fn files(args: &PluginNewArgs, name: &str) -> Result<Vec<(&'static str, String)>
     let mut files = match args.language {
         Language::Python => vec![("controller.py", include_str!("new/controller.py").to_owned())],
         Language::C => vec![
-            ("controller.c", include_str!("new/controller.c").to_owned()),
+            ("controller.c", include_str!("../../examples/c/headway.c").to_owned()),
             makefile("CC", "cc", "CFLAGS", "c"),
         ],
         Language::Cpp => vec![

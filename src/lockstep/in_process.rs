@@ -247,6 +247,7 @@ impl InProcess {
             state: state.records(),
             summaries: &summaries.iter().map(Frame::records).collect::<Vec<_>>(),
             coordination: &coordination.iter().map(Frame::records).collect::<Vec<_>>(),
+            feedback: &[],
             commands: &commands
                 .iter()
                 .map(|frame| CommandPart { generation: frame.header().generation, records: frame.records() })

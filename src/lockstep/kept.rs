@@ -74,6 +74,8 @@ impl KeptStep {
             summaries: &[],
             coordination: &[&news],
             commands: &commands,
+            // Told to controllers, and of no use to who looks on.
+            feedback: &[],
             misses: self.misses,
             policy: self.policy,
             state_hash: self.state_hash,

@@ -25,7 +25,7 @@ use crate::scenario::ControllerNames;
 use crate::step::StepFrames;
 use crate::transport::{Frame, TransportError};
 use crate::world::AdvanceError;
-use ipc_schemas::{FrameHeader, HeaderFault, Role, VehicleState};
+use ipc_schemas::{Feedback, FrameHeader, HeaderFault, Role, VehicleState};
 
 /// What a driver did.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -140,6 +140,17 @@ pub enum LockstepError {
 pub trait Observer: std::fmt::Debug {
     /// A step has been answered, or is the last, which nobody answers.
     fn observe(&mut self, frames: &StepFrames<'_>) -> Result<(), TransportError>;
+}
+
+/// The way to controllers written elsewhere: what became of their answers.
+pub trait Feedbacks: std::fmt::Debug {
+    /// Tells one of them, if there is such a one: at once, before anything that is sent later.
+    fn tell(
+        &mut self,
+        controller: u16,
+        header: FrameHeader,
+        records: &[Feedback],
+    ) -> Result<(), TransportError>;
 }
 
 /// A state to be answered.

@@ -5,7 +5,7 @@ use crate::control::pool::PoolError;
 use crate::scenario::ControllerNames;
 use crate::trace;
 use crate::world::CommandFault;
-use ipc_schemas::{FrameHeader, HeaderFault, Role};
+use ipc_schemas::{self as frames, Feedback, FrameHeader, HeaderFault, Role};
 use serde::{Deserialize, Serialize};
 
 /// Why a frame was not taken.
@@ -54,6 +54,46 @@ pub enum Refusal {
         /// Zone named.
         zone: u32,
     },
+}
+
+impl Refusal {
+    /// The same as a controller is told it, of its answer to this step.
+    pub fn feedback(&self, step: u64, controller: u16) -> Option<Feedback> {
+        let header = |field, found: u64, expected: u64| Feedback {
+            value: found as f64,
+            least: expected as f64,
+            greatest: expected as f64,
+            rule: frames::RULE_OTHER,
+            field,
+            vehicle: frames::NO_VEHICLE,
+            zone: frames::NO_ZONE,
+            toward: frames::NO_VEHICLE,
+            ..Feedback::default()
+        };
+        let told = match self {
+            Refusal::Command { fault, .. } => fault.feedback(),
+            Refusal::Unexpected { step: found } => {
+                Feedback { rule: frames::RULE_UNASKED, ..header(frames::FIELD_STEP, *found, step) }
+            }
+            Refusal::Header(fault) => match *fault {
+                HeaderFault::OtherSchema { .. } => header(frames::FIELD_SCHEMA_HASH, 0, 0),
+                HeaderFault::OtherRun { .. } => header(frames::FIELD_RUN_ID, 0, 0),
+                HeaderFault::OtherSender { .. } => header(frames::FIELD_SENDER, 0, 0),
+                HeaderFault::OldGeneration { expected, found }
+                | HeaderFault::UnknownGeneration { expected, found } => {
+                    header(frames::FIELD_GENERATION, found.into(), expected.into())
+                }
+                HeaderFault::OtherStep { expected, found } => header(frames::FIELD_STEP, found, expected),
+                HeaderFault::OtherCount { announced, found } => {
+                    header(frames::FIELD_RECORD_COUNT, announced.into(), found as u64)
+                }
+            },
+            Refusal::Stranger { .. } | Refusal::Coordination { .. } | Refusal::ForeignZone { .. } => {
+                return None;
+            }
+        };
+        Some(Feedback { step, controller, ..told })
+    }
 }
 
 /// The sender a header names; the codes come off the wire and may name nobody.

@@ -4,8 +4,8 @@ use super::kept::KeptStep;
 use super::members::check_sender;
 use super::refusals::Refusals;
 use super::{
-    Awaited, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal, RefusedFrames, Seat,
-    mask_of,
+    Awaited, Feedbacks, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal,
+    RefusedFrames, Seat, mask_of,
 };
 use crate::scenario::ControllerNames;
 use crate::scenario::share::zones_of;
@@ -13,8 +13,8 @@ use crate::step::{CommandPart, POLICY_NONE, StepFrames};
 use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
 use crate::world::{PutIn, Sheet, World};
 use ipc_schemas::{
-    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader, Member, Role, VehicleCommand,
-    VehicleState, ZoneSummary,
+    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, Feedback, FrameHeader, Member, Role,
+    VehicleCommand, VehicleState, ZoneSummary,
 };
 
 /// The world's ends of the services.
@@ -60,6 +60,11 @@ where
     /// Controllers nobody waits for any more: the world puts in what they do, as the shield allows.
     abandoned: u64,
     observer: Option<Box<dyn Observer>>,
+    /// Where controllers written elsewhere are told what became of their answers.
+    feedbacks: Option<Box<dyn Feedbacks>>,
+    /// What they have been told: of refusals since the last state, and all that the last state came with.
+    refused_now: Vec<Feedback>,
+    told: Vec<Feedback>,
     /// The records of the state published last, for the observer.
     published: Vec<VehicleState>,
     /// A step that is shown once it is over.
@@ -117,6 +122,9 @@ where
             put_in_verdict: 0,
             abandoned: 0,
             observer: None,
+            feedbacks: None,
+            refused_now: Vec::new(),
+            told: Vec::new(),
             published: Vec::new(),
             kept: KeptStep::default(),
             phase: Phase::Publish,
@@ -126,6 +134,11 @@ where
     /// Shows every step to an observer from now on; needs the ledger.
     pub fn observe(&mut self, observer: Box<dyn Observer>) {
         self.observer = Some(observer);
+    }
+
+    /// Tells controllers written elsewhere from now on what becomes of their answers.
+    pub fn tell(&mut self, feedbacks: Box<dyn Feedbacks>) {
+        self.feedbacks = Some(feedbacks);
     }
 
     /// Keeps the step whose state has been published last, to be shown when it is over; called while others work on
@@ -380,6 +393,7 @@ where
             flags: if finished { FLAG_END_OF_RUN } else { 0 } | if put_in != 0 { FLAG_MISSED } else { 0 },
             ..self.identity.header(step, self.world.time_ns())
         };
+        self.tell_feedback(header)?;
         // Coordinators first: theirs is the longer way.
         for (index, outbox) in self.ports.coordinator_states.iter_mut().enumerate() {
             if finished || masks.acting >> index & 1 == 1 {
@@ -413,6 +427,20 @@ where
             let coordination = if self.ledger.is_some() { masks.acting } else { 0 };
             Phase::Collect(Missing { commands: mask_of(self.controllers.len() as u32), coordination })
         };
+        Ok(())
+    }
+
+    /// Tells controllers written elsewhere what the shield found of their last commands. Before the state, so that whoever has
+    /// that has this.
+    fn tell_feedback(&mut self, header: FrameHeader) -> Result<(), LockstepError> {
+        let Some(feedbacks) = &mut self.feedbacks else { return Ok(()) };
+        self.told.clear();
+        self.told.extend_from_slice(self.world.feedback());
+        self.told.sort_unstable_by_key(|f| (f.controller, f.zone, f.vehicle));
+        for part in self.told.chunk_by(|a, b| a.controller == b.controller) {
+            feedbacks.tell(part[0].controller, header, part)?;
+        }
+        self.told.append(&mut self.refused_now);
         Ok(())
     }
 
@@ -463,6 +491,7 @@ where
             summaries: &[&summaries],
             coordination: &coordination,
             commands: &commands,
+            feedback: &self.told,
             misses: if controllers == 0 { 0 } else { self.put_in },
             policy: if self.put_in == 0 { POLICY_NONE } else { u32::from(self.put_in_verdict) },
             state_hash: self.world.state_hash(),
@@ -500,7 +529,7 @@ where
                 }
                 Err(None) => self.refusals.late += 1,
                 Err(Some(refusal)) => {
-                    self.refuse(Role::Controller, &header, frame.origin(), refusal);
+                    self.refuse(Role::Controller, &header, frame.origin(), refusal)?;
                     self.detained.0.push(frame);
                 }
             }
@@ -552,7 +581,7 @@ where
                 }
                 Err(None) => self.refusals.late += 1,
                 Err(Some(refusal)) => {
-                    self.refuse(Role::Coordinator, &header, frame.origin(), refusal);
+                    self.refuse(Role::Coordinator, &header, frame.origin(), refusal)?;
                     self.detained.1.push(frame);
                 }
             }
@@ -589,7 +618,13 @@ where
         }
     }
 
-    fn refuse(&mut self, role: Role, header: &FrameHeader, origin: u128, refusal: Refusal) {
+    fn refuse(
+        &mut self,
+        role: Role,
+        header: &FrameHeader,
+        origin: u128,
+        refusal: Refusal,
+    ) -> Result<(), LockstepError> {
         let ports = &self.ports;
         let process_id = self.refusals.enter(header, origin, refusal.clone(), || match role {
             Role::Coordinator => ports.coordination.as_ref().and_then(|inbox| inbox.process_of(origin)),
@@ -599,8 +634,25 @@ where
         let seats = if role == Role::Coordinator { &self.coordinators } else { &self.controllers };
         let own = seats.iter().zip(0..).find(|(seat, _)| seat.process_id == process_id);
         if let Some((_, index)) = own {
+            self.tell_refusal(role, index, &refusal)?;
             self.suspect = Some((role, index, refusal));
         }
+        Ok(())
+    }
+
+    /// Tells a controller that its answer was not taken, once in a step: it may answer anew.
+    fn tell_refusal(&mut self, role: Role, index: u16, refusal: &Refusal) -> Result<(), LockstepError> {
+        let Some(feedbacks) = self.feedbacks.as_mut().filter(|_| role == Role::Controller) else {
+            return Ok(());
+        };
+        let step = self.world.step();
+        let known = self.refused_now.iter().any(|told| told.controller == index);
+        if let Some(told) = refusal.feedback(step, index).filter(|_| !known) {
+            self.refused_now.push(told);
+            let header = self.identity.header(step, self.world.time_ns());
+            feedbacks.tell(index, header, std::slice::from_ref(&told))?;
+        }
+        Ok(())
     }
 }
 

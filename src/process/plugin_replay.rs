@@ -5,7 +5,7 @@
 
 use super::attach::{Readiness, Reception};
 use super::plugin_child::PluginChild;
-use super::services::MembersOutbox;
+use super::services::{MembersOutbox, create_feedback};
 use super::{LatencyUs, ProcessError, WaitMode, new_histogram};
 use crate::lockstep::Handover;
 use crate::record::{Damage, FileSource, Reader};
@@ -16,7 +16,7 @@ use crate::transport::iox::{IoxInbox, IoxOutbox, RunName, RunSpace, ServiceLimit
 use crate::transport::{Backlog, Frame, Inbox, Loan, Outbox};
 use hdrhistogram::Histogram;
 use ipc_schemas::{
-    self as frames, Assignment, ExpectedHeader, FLAG_END_OF_RUN, FrameHeader, Member, Role,
+    self as frames, Assignment, ExpectedHeader, FLAG_END_OF_RUN, Feedback, FrameHeader, Member, Role,
     VERDICT_INFEASIBLE, VehicleCommand, VehicleState,
 };
 use serde::Serialize;
@@ -150,6 +150,9 @@ pub fn replay_plugin(
     let run: RunName = format!("replay-{}", std::process::id()).parse().expect("letters, a dash and digits");
     let space = RunSpace::enter(&run)?;
     let mut stage = Stage::set(&space, &scenario, reader, options)?;
+    let known = reader.scenario().plugins.iter().position(|plugin| plugin.name == name);
+    stage.recorded_as =
+        known.map(|at| reader.metadata().controllers as usize - reader.scenario().plugins.len() + at);
     let mut steps = reader.steps();
     let mut at_hand = None;
     for step in steps.by_ref() {
@@ -231,6 +234,9 @@ struct Stage<'a> {
     coordination: Vec<IoxOutbox<Assignment>>,
     commands: IoxInbox<VehicleCommand>,
     members: MembersOutbox,
+    feedback: IoxOutbox<Feedback>,
+    /// Index of the controller in the recording, if it was in it.
+    recorded_as: Option<usize>,
     run_id: u64,
     /// By zone.
     in_force: Vec<Vec<Assignment>>,
@@ -261,6 +267,7 @@ impl<'a> Stage<'a> {
         let coordination = space.create(frames::SERVICE_COORDINATION, limits(count, 3))?;
         let commands = space.create(frames::SERVICE_COMMAND, limits(3, 1))?;
         let members = space.create(frames::SERVICE_MEMBERS, MembersOutbox::limits(3, nodes))?;
+        let feedback = create_feedback(space, INDEX)?;
         Ok(Stage {
             scenario,
             options,
@@ -269,6 +276,8 @@ impl<'a> Stage<'a> {
             coordination: (0..count).map(|_| coordination.outbox(512)).collect::<Result<_, _>>()?,
             commands: commands.inbox()?,
             members: MembersOutbox::open(&members, run_id)?,
+            feedback: feedback.outbox(16)?,
+            recorded_as: None,
             reception: Reception::open(space, scenario, run_id, (coordinators, INDEX + 1), WaitMode::Hybrid)?,
             run_id,
             in_force: vec![Vec::new(); scenario.network.zones.len()],
@@ -359,6 +368,11 @@ impl<'a> Stage<'a> {
             generation: 0,
             ..step.header
         };
+        let is_own = |f: &&Feedback| self.recorded_as == Some(usize::from(f.controller));
+        let told: Vec<Feedback> = step.feedback.iter().filter(is_own).copied().collect();
+        if !told.is_empty() {
+            self.feedback.loan(header, told.len(), |s| told.iter().for_each(|r| s.push(*r)))?.send()?;
+        }
         let sent = Instant::now();
         let states = step.state.iter().copied();
         self.state.loan(header, step.state.len(), |s| states.for_each(|r| s.push(r)))?.send()?;

@@ -1,14 +1,17 @@
 //! The services of a run, as its world creates them, and whose bells are rung with them.
 
 use super::WaitMode;
-use crate::lockstep::{Identity, WorldDriver, WorldPorts};
+use crate::lockstep::{Feedbacks, Identity, WorldDriver, WorldPorts};
 use crate::scenario::Scenario;
 use crate::scenario::share::neighbour_coordinators;
 use crate::transport::iox::{
     BellRope, Bells, IoxInbox, IoxOutbox, RunSpace, Service, ServiceLimits, SpaceError,
 };
 use crate::transport::{Backlog, Loan, Outbox, Slots, TransportError};
-use ipc_schemas::{self as frames, Assignment, Member, Role, VehicleCommand, VehicleState, ZoneSummary};
+use ipc_schemas::{
+    self as frames, Assignment, Feedback, FrameHeader, Member, Role, VehicleCommand, VehicleState,
+    ZoneSummary,
+};
 use std::ops::Range;
 
 /// The world's ends of the services.
@@ -43,6 +46,8 @@ pub(super) struct Services {
     /// Whether the world listens to coordination too.
     keeps: bool,
     members: Service<Member>,
+    /// Of the controllers written elsewhere, which come last.
+    feedback: Vec<Service<Feedback>>,
     _summaries: Vec<Service<ZoneSummary>>,
     controllers: u32,
 }
@@ -79,6 +84,42 @@ impl MembersOutbox {
     }
 }
 
+/// What controllers written elsewhere are told of their answers: one service each.
+#[derive(Debug)]
+pub(super) struct FeedbackOutboxes {
+    /// Index of the first of them: behind the pool.
+    first: u32,
+    outboxes: Vec<IoxOutbox<Feedback>>,
+}
+
+/// Feedback of one controller that may wait: of a refusal and of the step after it, twice.
+const FEEDBACK: Backlog = Backlog::Bounded(4);
+
+/// The service of one controller's feedback.
+pub(super) fn create_feedback(space: &RunSpace, index: u32) -> Result<Service<Feedback>, SpaceError> {
+    let name = format!("{}{index}", frames::SERVICE_FEEDBACK_PREFIX);
+    // One that is started again may come before its predecessor's place has been cleared.
+    let limits = ServiceLimits { publishers: 1, subscribers: 3, nodes: 2 + STRANGERS, backlog: FEEDBACK };
+    space.create(&name, limits)
+}
+
+impl Feedbacks for FeedbackOutboxes {
+    fn tell(
+        &mut self,
+        controller: u16,
+        header: FrameHeader,
+        records: &[Feedback],
+    ) -> Result<(), TransportError> {
+        let at = u32::from(controller).checked_sub(self.first);
+        if let Some(outbox) = at.and_then(|at| self.outboxes.get_mut(at as usize)) {
+            outbox
+                .loan(header, records.len(), |slots| records.iter().for_each(|r| slots.push(*r)))?
+                .send()?;
+        }
+        Ok(())
+    }
+}
+
 impl Services {
     pub(super) fn create(
         space: &RunSpace,
@@ -108,6 +149,9 @@ impl Services {
                 .create(frames::SERVICE_COORDINATION, limits(m + STRANGERS, n + usize::from(keeps)))?,
             keeps,
             members: space.create(frames::SERVICE_MEMBERS, MembersOutbox::limits(m + n, nodes))?,
+            feedback: (controllers - scenario.plugins.len() as u32..controllers)
+                .map(|index| create_feedback(space, index))
+                .collect::<Result<_, _>>()?,
             _summaries: (0..m)
                 .map(|i| {
                     let name = format!("{}{i}", frames::SERVICE_SUMMARY_PREFIX);
@@ -143,6 +187,13 @@ impl Services {
             command: self.command.inbox()?,
             coordination: if self.keeps { Some(self.coordination.inbox()?) } else { None },
         })
+    }
+
+    /// What controllers written elsewhere are told; nothing where there are none.
+    pub(super) fn feedbacks(&self) -> Result<Option<FeedbackOutboxes>, SpaceError> {
+        let outboxes: Vec<_> = self.feedback.iter().map(|s| s.outbox(16)).collect::<Result<_, _>>()?;
+        let first = self.controllers - outboxes.len() as u32;
+        Ok((!outboxes.is_empty()).then_some(FeedbackOutboxes { first, outboxes }))
     }
 
     /// The world's word on who has which place.

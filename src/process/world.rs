@@ -198,6 +198,7 @@ pub fn run_world(
     };
     let bells = space.create_bells()?;
     let ports = services.world_ports(&bells, scenario, wait)?;
+    let feedbacks = services.feedbacks()?;
     let mut members = services.members_outbox(run_id)?;
     // Plug-ins ring no bells: with one in the run, the world polls.
     let rung = wait.has_bell(Role::World) && scenario.plugins.is_empty();
@@ -221,6 +222,9 @@ pub fn run_world(
     }
     if let Some(observed) = observed {
         driver.observe(Box::new(observed));
+    }
+    if let Some(feedbacks) = feedbacks {
+        driver.tell(Box::new(feedbacks));
     }
     let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
     let waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());

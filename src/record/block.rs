@@ -1,7 +1,7 @@
 //! One step as one block of bytes, which needs nothing outside itself to be read.
 //!
 //! ```text
-//! BlockHead | Part per controller | states | summaries | assignments | commands
+//! BlockHead | Part per controller | states | summaries | assignments | commands | feedback
 //! ```
 //!
 //! All parts are multiples of 8 bytes, little-endian, records as they travel. The head ends with a checksum
@@ -9,7 +9,8 @@
 
 use crate::step::{CommandPart, Commands, Step, StepFrames};
 use ipc_schemas::{
-    Assignment, FrameHeader, Record, VehicleCommand, VehicleState, ZoneSummary, bytes_of, records_from,
+    Assignment, Feedback, FrameHeader, Record, VehicleCommand, VehicleState, ZoneSummary, bytes_of,
+    records_from,
 };
 use xxhash_rust::xxh3::xxh3_64;
 use zerocopy::{FromBytes, Immutable, IntoBytes};
@@ -32,7 +33,7 @@ pub(super) struct BlockHead {
     pub commands: u32,
     pub controllers: u32,
     pub policy: u32,
-    pub reserved: u32,
+    pub feedback: u32,
     /// XXH3-64 of all that is above.
     pub check: u64,
 }
@@ -48,12 +49,13 @@ struct PartHead {
 pub(super) const HEAD: usize = size_of::<BlockHead>();
 
 /// Bytes of a record of each section, in order.
-const SIZES: [u64; 5] = [
+const SIZES: [u64; 6] = [
     size_of::<PartHead>() as u64,
     size_of::<VehicleState>() as u64,
     size_of::<ZoneSummary>() as u64,
     size_of::<Assignment>() as u64,
     size_of::<VehicleCommand>() as u64,
+    size_of::<Feedback>() as u64,
 ];
 
 /// Why bytes are not a block.
@@ -97,8 +99,9 @@ impl BlockHead {
         xxh3_64(&self.as_bytes()[..HEAD - size_of::<u64>()])
     }
 
-    fn counts(&self) -> [u32; 5] {
-        [self.controllers, self.header.record_count, self.summaries, self.assignments, self.commands]
+    fn counts(&self) -> [u32; 6] {
+        let BlockHead { controllers, summaries, assignments, commands, feedback, .. } = *self;
+        [controllers, self.header.record_count, summaries, assignments, commands, feedback]
     }
 
     /// 32-bit counts of small records do not overflow 64 bits.
@@ -123,7 +126,7 @@ impl StepFrames<'_> {
             commands: total(&mut self.commands.iter().map(|p| p.records.len())),
             controllers: self.commands.len() as u32,
             policy: self.policy,
-            reserved: 0,
+            feedback: self.feedback.len() as u32,
             check: 0,
         }
     }
@@ -146,6 +149,7 @@ impl StepFrames<'_> {
         self.summaries.iter().for_each(|s| write(bytes_of(s)));
         self.coordination.iter().for_each(|s| write(bytes_of(s)));
         self.commands.iter().for_each(|p| write(bytes_of(p.records)));
+        write(bytes_of(self.feedback));
     }
 
     /// Appends the block to a buffer.
@@ -167,7 +171,7 @@ impl Step {
         if head.length != block.len() as u64 {
             return Err(BlockFault::Counts);
         }
-        let [controllers, states, summaries, assignments, commands] = head.counts();
+        let [controllers, states, summaries, assignments, commands, feedback] = head.counts();
         let mut rest = Rest(&block[HEAD..]);
         let mut parts = Vec::new();
         for _ in 0..controllers {
@@ -187,6 +191,7 @@ impl Step {
                 .iter()
                 .map(|p| Ok(Commands { generation: p.generation, records: rest.records(p.records)? }))
                 .collect::<Result<_, BlockFault>>()?,
+            feedback: rest.records(feedback)?,
             misses: head.misses,
             policy: head.policy,
             state_hash: head.state_hash,
@@ -206,6 +211,7 @@ impl Step {
             summaries: &[&self.summaries],
             coordination: &[&self.coordination],
             commands: &commands,
+            feedback: &self.feedback,
             misses: self.misses,
             policy: self.policy,
             state_hash: self.state_hash,

@@ -59,6 +59,8 @@ pub struct Projection {
     pub u_mps2: f64,
     /// What bounded it; `None` when it is the wish.
     pub row: Option<Row>,
+    /// Toward which of the partners, by its place among them; `None` when it is none of theirs.
+    pub toward: Option<usize>,
 }
 
 /// Slack below which the shield leaves a vehicle no choice but `u_min`, m. Braking at `u_min` keeps the
@@ -274,12 +276,12 @@ impl Shield {
         P: Iterator<Item = Partner>,
     {
         let u_min = -self.braking_mps2;
-        let mut best = Projection { u_mps2: wish_mps2, row: None };
+        let mut best = Projection { u_mps2: wish_mps2, row: None, toward: None };
         if v_mps + best.u_mps2 * self.dt_s > self.v_max_mps + RESERVE_MPS {
             let u = ((self.v_max_mps - v_mps) / self.dt_s).max(u_min);
-            best = Projection { u_mps2: u, row: Some(Row::Speed) };
+            best = Projection { u_mps2: u, row: Some(Row::Speed), toward: None };
         }
-        for partner in partners {
+        for (at, partner) in partners.enumerate() {
             let admits = |u: f64| self.admits(&Held::new(x_m, v_mps, u), &partner);
             if admits(best.u_mps2) {
                 continue;
@@ -303,7 +305,7 @@ impl Shield {
                     DutyKind::Merge => Row::Merge,
                     DutyKind::Cross => Row::Cross,
                 };
-                best = Projection { u_mps2: low, row: Some(row) };
+                best = Projection { u_mps2: low, row: Some(row), toward: Some(at) };
             }
         }
         best

@@ -16,7 +16,7 @@ use crate::lists::AHEAD;
 use crate::scenario::{Drivers, Scenario, ShieldMode};
 use crate::shield::{Partner, Row, Shield};
 use crate::vehicle::Held;
-use ipc_schemas::{self as frames, VehicleCommand};
+use ipc_schemas::{self as frames, Feedback, VehicleCommand};
 use std::collections::HashMap;
 
 /// A command frame the world cannot take.
@@ -111,11 +111,72 @@ pub enum CommandFault {
         verdict: u16,
     },
     /// The planned exit, which other vehicles may read, is not a number.
-    #[error("record {record}, field planned_exit_time_s or planned_exit_speed_mps: not finite")]
+    #[error("record {record}, field {}: vehicle {vehicle} has {value}", if *is_speed { "planned_exit_speed_mps" } else { "planned_exit_time_s" })]
     BadIntent {
         /// Place in the frame.
         record: usize,
+        /// The vehicle.
+        vehicle: u32,
+        /// Whether it is the speed, and not the instant.
+        is_speed: bool,
+        /// What was sent.
+        value: f64,
     },
+}
+
+impl CommandFault {
+    /// The same as a controller is told it; step and controller are for the caller to fill in.
+    pub fn feedback(&self) -> Feedback {
+        let told = |record: usize, vehicle, rule, field| Feedback {
+            record: record as u32,
+            vehicle,
+            rule,
+            field,
+            zone: frames::NO_ZONE,
+            toward: frames::NO_VEHICLE,
+            ..Feedback::default()
+        };
+        use CommandFault as Fault;
+        match *self {
+            Fault::UnknownVehicle { record, vehicle } => {
+                told(record, vehicle, frames::RULE_UNKNOWN, frames::FIELD_VEHICLE)
+            }
+            Fault::ForeignVehicle { record, vehicle, .. } => {
+                told(record, vehicle, frames::RULE_FOREIGN, frames::FIELD_VEHICLE)
+            }
+            Fault::Duplicate { record, vehicle } => {
+                told(record, vehicle, frames::RULE_TWICE, frames::FIELD_VEHICLE)
+            }
+            Fault::MissingVehicle { record, vehicle, zone } => {
+                Feedback { zone, ..told(record, vehicle, frames::RULE_MISSING, frames::FIELD_VEHICLE) }
+            }
+            Fault::OtherZone { record, vehicle, zone, expected } => Feedback {
+                value: f64::from(zone),
+                least: f64::from(expected),
+                greatest: f64::from(expected),
+                zone: expected,
+                ..told(record, vehicle, frames::RULE_OTHER, frames::FIELD_ZONE)
+            },
+            Fault::NotFinite { record, vehicle, .. } => {
+                told(record, vehicle, frames::RULE_NOT_FINITE, frames::FIELD_U_MPS2)
+            }
+            Fault::OutOfLimits { record, vehicle, u_mps2, min_mps2, max_mps2 } => Feedback {
+                value: u_mps2,
+                least: min_mps2,
+                greatest: max_mps2,
+                ..told(record, vehicle, frames::RULE_LIMITS, frames::FIELD_U_MPS2)
+            },
+            Fault::BadVerdict { record, vehicle, verdict } => Feedback {
+                value: f64::from(verdict),
+                greatest: f64::from(frames::VERDICT_INFEASIBLE),
+                ..told(record, vehicle, frames::RULE_LIMITS, frames::FIELD_VERDICT)
+            },
+            Fault::BadIntent { record, vehicle, is_speed, .. } => {
+                let fields = [frames::FIELD_PLANNED_EXIT_TIME_S, frames::FIELD_PLANNED_EXIT_SPEED_MPS];
+                told(record, vehicle, frames::RULE_NOT_FINITE, fields[usize::from(is_speed)])
+            }
+        }
+    }
 }
 
 /// A vehicle that leaves the network more slowly speeds up to this outside, m/s.
@@ -157,6 +218,8 @@ pub(super) struct Gateway {
     partners: Vec<(Partner, usize)>,
     /// Whether a command of this step is to be shielded whatever the mode.
     falls_back: bool,
+    /// What the shield found of the commands of controllers written elsewhere, in the step just ended.
+    feedback: Vec<Feedback>,
 }
 
 impl Gateway {
@@ -172,6 +235,7 @@ impl Gateway {
             drivers,
             partners: Vec::with_capacity(16),
             falls_back: false,
+            feedback: Vec::new(),
         }
     }
 
@@ -265,8 +329,10 @@ impl World {
                         expected: zone,
                     });
                 }
-                if !(command.planned_exit_time_s.is_finite() && command.planned_exit_speed_mps.is_finite()) {
-                    return Err(CommandFault::BadIntent { record });
+                let intent = [command.planned_exit_time_s, command.planned_exit_speed_mps];
+                if let Some(at) = intent.iter().position(|value| !value.is_finite()) {
+                    let (is_speed, value) = (at == 1, intent[at]);
+                    return Err(CommandFault::BadIntent { record, vehicle, is_speed, value });
                 }
                 if command.verdict > greatest_verdict {
                     let verdict = command.verdict;
@@ -360,6 +426,12 @@ impl World {
             .collect()
     }
 
+    /// What the shield found of the commands that controllers written elsewhere gave for the step just ended, as far as it
+    /// had to bound them: by zones, the last first.
+    pub fn feedback(&self) -> &[Feedback] {
+        &self.gateway.feedback
+    }
+
     /// Forgets the commands taken for this step, so that all can be given again.
     pub fn forget_commands(&mut self) {
         self.commanded = 0;
@@ -410,6 +482,7 @@ impl World {
             faults.deliver(self.step, time_s, Limits::of(scenario), &mut self.cars, first);
         }
         let shields = self.gateway.mode != ShieldMode::Off || self.gateway.falls_back;
+        self.gateway.feedback.clear();
         for zone in (0..self.zones.len()).rev() {
             if self.links.cars > 0 {
                 self.links.range(zone as u32).for_each(|link| self.drive_link(scenario, zone, link, dt_s));
@@ -481,7 +554,7 @@ impl World {
 
     /// Projects the commands of a zone's members, in passing order.
     fn shield_zone(&mut self, zone: usize) {
-        let Gateway { mode, shields, drivers, rows, partners, .. } = &mut self.gateway;
+        let Gateway { mode, shields, drivers, rows, partners, feedback, .. } = &mut self.gateway;
         let cars = &mut self.cars[zone];
         let owed = &mut self.owed[zone];
         for &at in &self.order[zone] {
@@ -491,7 +564,8 @@ impl World {
                 continue;
             }
             let shield = &shields[usize::from(car.kind)];
-            let row = &mut rows[drivers.of(zone as u32, car.path) as usize];
+            let driver = drivers.of(zone as u32, car.path);
+            let row = &mut rows[driver as usize];
             partners.clear();
             for (at, owed) in owed[car.owed.0 as usize..car.owed.1 as usize].iter_mut().enumerate() {
                 let other = &cars[owed.duty.partner as usize];
@@ -507,7 +581,29 @@ impl World {
             row.commands += 1;
             let all = partners.iter().map(|(partner, _)| *partner);
             let found = shield.project(car.x_m, car.v_mps, car.command_mps2, all);
-            row.bounded += u64::from(car.visit.beyond || found.row.is_some());
+            let is_bounded = car.visit.beyond || found.row.is_some();
+            row.bounded += u64::from(is_bounded);
+            if is_bounded && driver >= drivers.pool() {
+                let toward = found.toward.map(|at| owed[car.owed.0 as usize + partners[at].1].duty.partner);
+                feedback.push(Feedback {
+                    value: car.command_mps2,
+                    least: self.kinds[usize::from(car.kind)].u_min_mps2,
+                    greatest: found.u_mps2,
+                    step: self.step,
+                    vehicle: car.vehicle,
+                    zone: zone as u32,
+                    toward: toward.map_or(frames::NO_VEHICLE, |at| cars[at as usize].vehicle),
+                    controller: driver as u16,
+                    row: match found.row {
+                        None => frames::ROW_LIMITS,
+                        Some(Row::Speed) => frames::ROW_SPEED,
+                        Some(Row::RearEnd) => frames::ROW_REAR_END,
+                        Some(Row::Merge) => frames::ROW_MERGE,
+                        Some(Row::Cross) => frames::ROW_CROSS,
+                    },
+                    ..Feedback::default()
+                });
+            }
             match found.row {
                 None => {}
                 Some(Row::Speed) => row.speed += 1,

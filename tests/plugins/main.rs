@@ -64,6 +64,8 @@ fn rust(name: &str) -> String {
             "pauses",
             "--example",
             "broken",
+            "--example",
+            "told",
         ]);
     });
     beside().join("examples").join(name).display().to_string()

@@ -59,6 +59,72 @@ fn a_controller_that_pauses_for_a_minute_catches_up_in_every_language() {
     }
 }
 
+#[test]
+fn what_became_of_an_answer_is_told_in_the_same_words_in_every_language() {
+    let folder = tempfile::tempdir().unwrap();
+    let fixtures = root().join("tests/fixtures");
+    let mut all = vec![("Rust", rust("told"))];
+    all.extend([("C", "told.c"), ("C++", "told.cpp")].map(|(language, file)| {
+        let into = folder.path().join(language);
+        std::fs::create_dir(&into).unwrap();
+        (language, compiled(&fixtures.join(file), &into))
+    }));
+    all.extend(python().map(|python| ("Python", format!("{python} {}", fixtures.join("told.py").display()))));
+    let told = |ended: &Ended| {
+        let lines = ended.err.lines().filter_map(|line| line.split_once("merge-2] told "));
+        lines.map(|(_, words)| words.to_owned()).collect::<Vec<_>>()
+    };
+    let file = folder.path().join("run.czlog");
+    let mut first = None;
+    for (language, command) in all {
+        // The shield says what it would do; the frame that errs is refused, and the run goes on.
+        let own = ["--shield", "observe", "--deadline", "0.9", "--on-miss", "hold", "--set", "end.time_s=60"];
+        let kept = ["--record", file.to_str().unwrap()];
+        let test_run = TestRun::new("told");
+        let (_, ended) =
+            driven(&test_run, &format!("CZ_ERRS_AT=200 exec {command}"), &[&own[..], &kept].concat());
+        test_run.assert_clean();
+        ended.expect(0, &["merge-2] refused 1"]);
+        let told = told(&ended);
+        let is = |line: &&String, words: &str| line.starts_with("step 200: ") && line.contains(words);
+        let refusals: Vec<_> = told.iter().filter(|line| is(line, "u_mps2 of")).collect();
+        assert!(
+            matches!(&refusals[..], [one] if one.ends_with(" is 9, at most 4 allowed")),
+            "{language}: {refusals:?}"
+        );
+        assert!(told.iter().any(|line| line.contains(" by merge toward ")), "{language}: {told:?}");
+        match &first {
+            None => first = Some(told),
+            Some(first) => assert_eq!(&told, first, "{language}"),
+        }
+    }
+    // What it was told is in the recording, and shown again.
+    let again = format!("CZ_ERRS_AT=200 exec {}", rust("told"));
+    let replay =
+        ["plugin", "replay", file.to_str().unwrap(), "--controller", "merge-2", "--", "sh", "-c", &again];
+    let output = cz().args(replay).output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    let again: Vec<_> = said.lines().filter_map(|line| line.split_once("told ")).map(|(_, l)| l).collect();
+    assert_eq!(again, first.unwrap(), "{said}");
+}
+
+#[test]
+fn an_answer_that_ends_the_run_is_named_to_its_controller() {
+    let mut all = vec![rust("told")];
+    let fixture = root().join("tests/fixtures/told.py");
+    all.extend(python().map(|python| format!("{python} {}", fixture.display())));
+    for command in all {
+        let test_run = TestRun::new("told-last");
+        let controller = format!("merge-2=CZ_ERRS_AT=300 exec {command}");
+        let ended = test_run.start("cz", &["--controller", &controller]).ended();
+        ended.expect(
+            1,
+            &["it had refused an answer: step 300: u_mps2 of vehicle ", " is 9, at most 4 allowed"],
+        );
+        test_run.assert_clean();
+    }
+}
+
 fn pauses_and_catches_up(language: &str, command: &str, policy: &str, arguments: &[&str]) {
     let test_run = TestRun::new("pause");
     let folder = tempfile::tempdir().unwrap();

@@ -175,7 +175,13 @@ class Law:
             known = zone.commanded == zone.commanded
             new = zone.entered & known
             assert not new.any(), "nobody is commanded before it comes"
-            seen["bounded"] += int((abs(zone.u - zone.commanded)[known] > 1e-9).sum())
+            changed = known & (abs(zone.u - zone.commanded) > 1e-9)
+            seen["bounded"] += int(changed.sum())
+            for at, told in enumerate(zone.bounded):
+                assert (told is not None) == bool(changed[at]), (zone.step, told, zone.u, zone.commanded)
+                if told is not None:
+                    assert told.greatest == zone.u[at] and told.value == zone.commanded[at] and told.row
+            assert zone.refusals == []
             out.append((30.0 - zone.v).clip(-4, 4))
         return out
 
@@ -187,7 +193,10 @@ control_zones.run(Law(), joint=True)
 "#;
     std::fs::write(&path, law).unwrap();
     let ended = driven(&python, &path, &["--shield", "on"]);
-    ended.expect(0, &["merge-2] Summary(step=600, time=60.0", "answered=600, skipped=0, missed=0)"]);
+    ended.expect(
+        0,
+        &["merge-2] Summary(step=600, time=60.0", "answered=600, skipped=0, missed=0, refused=0)"],
+    );
     let counts =
         ended.err.lines().find(|line| line.contains("partners=")).unwrap_or_else(|| panic!("{ended:?}"));
     // Whoever goes for 30 m/s is bounded now and then.

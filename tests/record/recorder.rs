@@ -71,6 +71,7 @@ fn steps_that_come_too_fast_are_left_out_and_reported() {
                 summaries: &[&step.summaries],
                 coordination: &[&step.coordination],
                 commands: &commands,
+                feedback: &[],
                 misses: step.misses,
                 policy: step.policy,
                 state_hash: step.state_hash,

@@ -30,6 +30,7 @@ fn each_step(scenario: &Arc<Scenario>, mut show: impl FnMut(&Step)) -> InProcess
                 summaries: frames.summaries.concat(),
                 coordination: frames.coordination.concat(),
                 commands: commands.collect(),
+                feedback: frames.feedback.to_vec(),
                 misses: frames.misses,
                 policy: frames.policy,
                 state_hash: frames.state_hash,

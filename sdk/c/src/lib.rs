@@ -6,8 +6,8 @@
 //! pointer a function returns points into the handle and lives until the next call that the header names.
 
 use control_zones_plugin::schemas::{
-    Assignment, CONSTRAINT_CROSS, CONSTRAINT_MERGE, CONSTRAINT_REAR_END, FrameHeader, PathSpec, RunSpec,
-    VehicleCommand, VehicleState,
+    Assignment, CONSTRAINT_CROSS, CONSTRAINT_MERGE, CONSTRAINT_REAR_END, Feedback, FrameHeader, PathSpec,
+    RunSpec, VehicleCommand, VehicleState,
 };
 use control_zones_plugin::{Commands, Error, Options, PartnerKind, Session, Wake};
 use std::cell::RefCell;
@@ -94,9 +94,11 @@ pub struct Vehicle {
     pub zone_states: *const VehicleState,
     /// Their number.
     pub zone_count: u64,
+    /// What the shield found of its last command, or null where it let it pass.
+    pub bounded: *const Feedback,
 }
 
-const _: () = assert!(size_of::<Vehicle>() == 80 + 4 * size_of::<usize>());
+const _: () = assert!(size_of::<Vehicle>() == 80 + 5 * size_of::<usize>());
 
 /// A step to be answered.
 #[repr(C)]
@@ -126,9 +128,11 @@ pub struct RunSummary {
     pub skipped: u64,
     /// Of the states seen, those before which the world had put something in for a controller that was late.
     pub missed: u64,
+    /// Answers that the world refused, as far as it said so: once in a step.
+    pub refused: u64,
 }
 
-const _: () = assert!(size_of::<StepInfo>() == 32 && size_of::<RunSummary>() == 40);
+const _: () = assert!(size_of::<StepInfo>() == 32 && size_of::<RunSummary>() == 48);
 
 fn fail(message: &str) {
     let text = CString::new(message.replace('\0', " ")).unwrap_or_default();
@@ -259,6 +263,7 @@ impl Plugin {
                 place: vehicle.place as u64,
                 zone_states: vehicle.zone_states().as_ptr(),
                 zone_count: vehicle.zone_states().len() as u64,
+                bounded: vehicle.bounded.map_or(null(), std::ptr::from_ref),
             };
             for partner in vehicle.partners() {
                 let control_zones_plugin::Partner { state, place, kind, x_m, conflict_m, gap_m } = partner;
@@ -347,9 +352,9 @@ pub unsafe extern "C" fn cz_step(plugin: *const Plugin) -> StepInfo {
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn cz_summary(plugin: *const Plugin) -> RunSummary {
     // SAFETY: a live handle.
-    let control_zones_plugin::Summary { step, time_s, answered, skipped, missed } =
+    let control_zones_plugin::Summary { step, time_s, answered, skipped, missed, refused } =
         unsafe { (*plugin).session.summary() };
-    RunSummary { step, time_s, answered, skipped, missed }
+    RunSummary { step, time_s, answered, skipped, missed, refused }
 }
 
 /// The header of the state frame; valid until `cz_send`. Null without a step.
@@ -391,6 +396,45 @@ pub unsafe extern "C" fn cz_vehicles(plugin: *const Plugin, count: *mut usize) -
         *count = vehicles.len();
         vehicles.as_ptr()
     }
+}
+
+/// The answers that the world refused since the last one it took, with field and rule; valid until `cz_send`.
+///
+/// # Safety
+/// `plugin` is from `cz_attach`; `count` may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_refusals(plugin: *const Plugin, count: *mut usize) -> *const Feedback {
+    // SAFETY: a live handle, and a place to write to.
+    let (session, count) = unsafe { (&(*plugin).session, &mut *count) };
+    *count = 0;
+    guarded(null(), || {
+        let refusals = session.step().refusals;
+        *count = refusals.len();
+        Ok(refusals.as_ptr())
+    })
+}
+
+/// Writes feedback in words, UTF-8, ended by 0 and cut to `size` bytes; returns how many bytes all of it has.
+///
+/// # Safety
+/// `feedback` may be read, and `size` bytes at `text` written; `text` may be null where `size` is 0.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn cz_feedback_text(
+    feedback: *const Feedback,
+    text: *mut c_char,
+    size: usize,
+) -> usize {
+    // SAFETY: by the caller's promise it may be read.
+    let words = unsafe { *feedback }.to_string();
+    if let Some(room) = size.checked_sub(1) {
+        let count = words.len().min(room);
+        // SAFETY: by the caller's promise there is room for `size` bytes, of which this writes `count + 1`.
+        unsafe {
+            std::ptr::copy_nonoverlapping(words.as_ptr().cast(), text, count);
+            text.add(count).write(0);
+        }
+    }
+    words.len()
 }
 
 /// All vehicles that one to be commanded (its place among `cz_vehicles`) must respect where they are now; valid until

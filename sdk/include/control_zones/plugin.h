@@ -67,12 +67,14 @@ typedef struct cz_vehicle {
     uint64_t place;          /**< its place among the records of its zone */
     const cz_vehicle_state_t *zone_states; /**< all records of its zone */
     uint64_t zone_count;     /**< their number */
+    const cz_feedback_t *bounded; /**< what the shield found of its last command, or NULL where it let it pass: row says
+                                       what bounded it, toward which vehicle, greatest is what it allowed, m/s^2 */
 } cz_vehicle_t;
 
 #if defined(__cplusplus)
-static_assert(sizeof(cz_vehicle_t) == 80 + 4 * sizeof(void *), "cz_vehicle_t as in the library");
+static_assert(sizeof(cz_vehicle_t) == 80 + 5 * sizeof(void *), "cz_vehicle_t as in the library");
 #elif defined(__STDC_VERSION__) && __STDC_VERSION__ >= 201112L
-_Static_assert(sizeof(cz_vehicle_t) == 80 + 4 * sizeof(void *), "cz_vehicle_t as in the library");
+_Static_assert(sizeof(cz_vehicle_t) == 80 + 5 * sizeof(void *), "cz_vehicle_t as in the library");
 #endif
 
 /** A vehicle that another must respect where the two are now. */
@@ -100,6 +102,7 @@ typedef struct cz_summary {
     uint64_t answered; /**< steps answered */
     uint64_t skipped;  /**< steps that passed without this controller between its answers */
     uint64_t missed;   /**< states before which the world had put something in for one that was late */
+    uint64_t refused;  /**< answers that the world refused, as far as it said so: once in a step */
 } cz_summary_t;
 
 /** Joins a run. NULL names stand for the environment's CZ_RUN and CZ_CONTROLLER. NULL on failure. */
@@ -128,6 +131,10 @@ const cz_vehicle_state_t *cz_states(const cz_plugin_t *plugin, size_t *count);
 const cz_vehicle_t *cz_vehicles(const cz_plugin_t *plugin, size_t *count);
 /** All vehicles that the one at this place among cz_vehicles must respect; valid until cz_send. */
 const cz_partner_t *cz_partners(const cz_plugin_t *plugin, size_t vehicle, size_t *count);
+/** The answers that the world refused since the last one it took, with field and rule; valid until cz_send. */
+const cz_feedback_t *cz_refusals(const cz_plugin_t *plugin, size_t *count);
+/** Writes feedback in words, ended by 0 and cut to size bytes; returns how many bytes all of it has. */
+size_t cz_feedback_text(const cz_feedback_t *feedback, char *text, size_t size);
 /** The coordination in force in a zone; valid until the next cz_wait. */
 const cz_assignment_t *cz_assignments(const cz_plugin_t *plugin, uint32_t zone, size_t *count);
 /** Lends the command frame, vehicles and zones filled in, accelerations 0; valid until cz_send. */

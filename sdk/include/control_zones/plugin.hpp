@@ -22,6 +22,7 @@
 
 #include <memory>
 #include <stdexcept>
+#include <string>
 #include <utility>
 
 namespace control_zones {
@@ -30,6 +31,13 @@ namespace control_zones {
 struct Error : std::runtime_error {
     Error() : std::runtime_error(cz_last_error()) {}
 };
+
+/// Feedback in words.
+inline std::string text(const cz_feedback_t &feedback) {
+    std::string words(cz_feedback_text(&feedback, nullptr, 0), '\0');
+    cz_feedback_text(&feedback, words.data(), words.size() + 1);
+    return words;
+}
 
 /// A borrowed range of records.
 template <class T> class Range {
@@ -78,6 +86,8 @@ public:
         const cz_partner_t *data = cz_partners(plugin_.get(), vehicle, &count);
         return {data, count};
     }
+    /// The answers that the world refused since the last one it took, with field and rule.
+    Range<const cz_feedback_t> refusals() const { return range(cz_refusals); }
     /// The step to be answered: its number, time and flags.
     cz_step_t step() const { return cz_step(plugin_.get()); }
     /// What the run has been so far.

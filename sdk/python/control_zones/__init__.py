@@ -18,6 +18,6 @@ may be kept, where numpy is installed, and lists where it is not.
 from . import _schemas as schemas
 from ._features import features
 from ._session import Error, Run, Session, Summary, run
-from ._view import Partner, ZoneView
+from ._view import Feedback, Partner, ZoneView
 
-__all__ = ["Error", "Partner", "Run", "Session", "Summary", "ZoneView", "features", "run", "schemas"]
+__all__ = ["Error", "Feedback", "Partner", "Run", "Session", "Summary", "ZoneView", "features", "run", "schemas"]

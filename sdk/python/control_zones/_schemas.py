@@ -17,7 +17,7 @@ if typing.TYPE_CHECKING:
     Record = typing.TypeVar("Record", bound=ctypes._CData)
 
 #: Hash of all record layouts: what the fields named `schema_hash` carry.
-SCHEMA_HASH = 0xf214663ee06bf4cd
+SCHEMA_HASH = 0x817d84fa9a9ed0eb
 
 #: `FrameHeader.sender_role`: the world integrator.
 ROLE_WORLD = 1
@@ -102,6 +102,63 @@ VERDICT_HELD = 4
 #: far as the shield allows.
 VERDICT_FALLBACK = 5
 
+#: `Feedback.row`: nothing of the shield's; the record is about a frame that was refused.
+ROW_NONE = 0
+#: `Feedback.row`: the greatest speed of the vehicle.
+ROW_SPEED = 1
+#: `Feedback.row`: the margin toward a vehicle ahead.
+ROW_REAR_END = 2
+#: `Feedback.row`: the margin toward a vehicle that passes a merge first.
+ROW_MERGE = 3
+#: `Feedback.row`: the margin toward a vehicle that crosses first.
+ROW_CROSS = 4
+#: `Feedback.row`: the command was not within the vehicle's limits, or no number.
+ROW_LIMITS = 5
+#: `Feedback.rule`: no frame was refused; the record is about the shield.
+RULE_NONE = 0
+#: `Feedback.rule`: not within the limits.
+RULE_LIMITS = 1
+#: `Feedback.rule`: no number.
+RULE_NOT_FINITE = 2
+#: `Feedback.rule`: another value than the only one there can be.
+RULE_OTHER = 3
+#: `Feedback.rule`: the vehicle is in no zone.
+RULE_UNKNOWN = 4
+#: `Feedback.rule`: another controller drives the vehicle.
+RULE_FOREIGN = 5
+#: `Feedback.rule`: the vehicle is commanded twice.
+RULE_TWICE = 6
+#: `Feedback.rule`: the vehicle has no command at its place in the frame.
+RULE_MISSING = 7
+#: `Feedback.rule`: nobody asked for an answer to the step.
+RULE_UNASKED = 8
+#: `Feedback.field`: none; the record is about the shield.
+FIELD_NONE = 0
+#: `Feedback.field`: `u_mps2` of a command.
+FIELD_U_MPS2 = 1
+#: `Feedback.field`: `planned_exit_time_s` of a command.
+FIELD_PLANNED_EXIT_TIME_S = 2
+#: `Feedback.field`: `planned_exit_speed_mps` of a command.
+FIELD_PLANNED_EXIT_SPEED_MPS = 3
+#: `Feedback.field`: `vehicle` of a command.
+FIELD_VEHICLE = 4
+#: `Feedback.field`: `zone` of a command.
+FIELD_ZONE = 5
+#: `Feedback.field`: `verdict` of a command.
+FIELD_VERDICT = 6
+#: `Feedback.field`: `step` of the header.
+FIELD_STEP = 7
+#: `Feedback.field`: `record_count` of the header.
+FIELD_RECORD_COUNT = 8
+#: `Feedback.field`: `generation` of the header.
+FIELD_GENERATION = 9
+#: `Feedback.field`: `run_id` of the header; its values do not stand here.
+FIELD_RUN_ID = 10
+#: `Feedback.field`: `schema_hash` of the header; its values do not stand here.
+FIELD_SCHEMA_HASH = 11
+#: `Feedback.field`: `sender_role` or `sender_index` of the header; their values do not stand here.
+FIELD_SENDER = 12
+
 #: `AttachRequest.controller`: a process of the built-in pool, or a coordinator.
 BUILT_IN = 0
 #: `AttachRequest.wanted_index`: any free index will do.
@@ -175,6 +232,9 @@ SERVICE_COORDINATION = "cz/coordination"
 SERVICE_SUMMARY_PREFIX = "cz/summary/"
 #: Controllers → world: `VehicleCommand` of every step.
 SERVICE_COMMAND = "cz/command"
+#: World → controller `i`, where it is one written elsewhere: `Feedback`, where there is something
+#: to say; `i` is appended.
+SERVICE_FEEDBACK_PREFIX = "cz/feedback/"
 #: World → coordinators and controllers: `Member`, who has which place. Overflows: only the last
 #: frame counts.
 SERVICE_MEMBERS = "cz/members"
@@ -536,6 +596,66 @@ class VehicleCommand(ctypes.Structure):
         return "cz.VehicleCommand.v2"
 
 
+class Feedback(ctypes.Structure):
+    """What became of a command, or why a frame of commands was not taken.
+
+    Where `row` is not 0: what the shield found of a vehicle's command, the last word on it where
+    there were several. Where `rule` is not 0: why a frame was refused, by the first record at
+    fault. A frame of the first comes before the state of the step after the command, and only where
+    there is something to say; one of the second at once.
+
+    Fields:
+        value: `row`: what was to be applied, m/s^2. `rule`: what the field held (0 where it is no
+            number).
+        least: The least that was allowed.
+        greatest: The greatest that was allowed; the shield's, where `row` says so. What was applied
+            is `u_mps2` of the state: with the shield only observing, this is not.
+        step: Step of the command.
+        vehicle: The vehicle, or `NO_VEHICLE`.
+        zone: Its zone, or `NO_ZONE`.
+        toward: `row`: the vehicle toward which, or `NO_VEHICLE`.
+        record: `rule`: place in the frame of the record at fault.
+        controller: Index of the controller that sent the command.
+        row: What of the shield bounded the command: 1 speed, 2 rear end, 3 merge, 4 cross, 5
+            limits.
+        rule: What the frame broke.
+        field: The field that did.
+    """
+
+    _fields_ = [
+        ("value", ctypes.c_double),
+        ("least", ctypes.c_double),
+        ("greatest", ctypes.c_double),
+        ("step", ctypes.c_uint64),
+        ("vehicle", ctypes.c_uint32),
+        ("zone", ctypes.c_uint32),
+        ("toward", ctypes.c_uint32),
+        ("record", ctypes.c_uint32),
+        ("controller", ctypes.c_uint16),
+        ("row", ctypes.c_uint16),
+        ("rule", ctypes.c_uint16),
+        ("field", ctypes.c_uint16),
+    ]
+
+    value: float
+    least: float
+    greatest: float
+    step: int
+    vehicle: int
+    zone: int
+    toward: int
+    record: int
+    controller: int
+    row: int
+    rule: int
+    field: int
+
+    @staticmethod
+    def type_name() -> str:
+        """Name under which the transport registers the type."""
+        return "cz.Feedback.v1"
+
+
 class Member(ctypes.Structure):
     """World → coordinators and controllers: the process that has a place in the run.
 
@@ -852,6 +972,7 @@ RECORDS: tuple[type[ctypes.Structure], ...] = (
     Assignment,
     ZoneSummary,
     VehicleCommand,
+    Feedback,
     Member,
     AttachRequest,
     AttachReply,
@@ -867,6 +988,7 @@ TYPE_NAMES = {
     "Assignment": "cz.Assignment.v3",
     "ZoneSummary": "cz.ZoneSummary.v2",
     "VehicleCommand": "cz.VehicleCommand.v2",
+    "Feedback": "cz.Feedback.v1",
     "Member": "cz.Member.v1",
     "AttachRequest": "cz.AttachRequest.v1",
     "AttachReply": "cz.AttachReply.v1",
@@ -978,6 +1100,24 @@ _LAYOUTS: dict[type[ctypes.Structure], tuple[int, int, dict[str, int]]] = {
             "binding_rows": 96,
             "mode": 100,
             "verdict": 102,
+        },
+    ),
+    Feedback: (
+        56,
+        8,
+        {
+            "value": 0,
+            "least": 8,
+            "greatest": 16,
+            "step": 24,
+            "vehicle": 32,
+            "zone": 36,
+            "toward": 40,
+            "record": 44,
+            "controller": 48,
+            "row": 50,
+            "rule": 52,
+            "field": 54,
         },
     ),
     Member: (

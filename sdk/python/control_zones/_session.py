@@ -17,7 +17,7 @@ import typing
 import iceoryx2
 
 from . import _schemas as s
-from ._view import Partners, ZoneView, frozen, structured
+from ._view import Feedback, Partners, ZoneView, feedback_of, frozen, structured
 
 if typing.TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -60,6 +60,8 @@ class Summary:
     skipped: int = 0
     #: Of the states seen, those before which the world had put something in for a controller that was late.
     missed: int = 0
+    #: Answers that the world refused, as far as it said so: once in a step.
+    refused: int = 0
 
 
 class Run:
@@ -208,6 +210,8 @@ class Session:
         self._states = self._service_of(s.SERVICE_STATE, s.VehicleState).subscriber_builder().create()
         self._coordination = self._service_of(s.SERVICE_COORDINATION, s.Assignment).subscriber_builder().create()
         self._members = self._service_of(s.SERVICE_MEMBERS, s.Member).subscriber_builder().create()
+        feedback = f"{s.SERVICE_FEEDBACK_PREFIX}{reply.index}"
+        self._feedback = self._service_of(feedback, s.Feedback).subscriber_builder().create()
         self._commands = (
             self._service_of(s.SERVICE_COMMAND, s.VehicleCommand)
             .publisher_builder()
@@ -231,6 +235,9 @@ class Session:
         self.summary = Summary()
         # Accelerations of the last answer, by vehicle.
         self._commanded: dict[int, float] = {}
+        # What the shield found of commands, by step and vehicle, and answers that were refused since the last one.
+        self._bounded: dict[int, dict[int, Feedback]] = {}
+        self._refusals: list[Feedback] = []
         self._ask_again_at: float | None = None
         self._state: _State | None = None
         self._complete = False
@@ -315,11 +322,13 @@ class Session:
                 raise TimeoutError(f"nothing came for {timeout} s")
             if now - checked >= 0.05:
                 checked = now
+                # Of a world that has ended nothing more can be had.
+                self._take_feedback()
                 if not _alive(self.reply.world_process_id):
                     # Its last frame may have come in the meantime.
                     if (ready := self._poll()) is not None:
                         return ready
-                    raise Error(f"the world (process {self.reply.world_process_id}) has ended without an end of the run")
+                    raise self._world_gone()
             if now - start >= _BUSY_S:
                 time.sleep(_NAP_S)
 
@@ -348,6 +357,9 @@ class Session:
         self._next_step = max(self._next_step, step + 1)
         self.summary.skipped += self._skipped(state.header)
         self._saw(state.header)
+        self._take_feedback()
+        for old in [told for told in self._bounded if told + 1 < step]:
+            del self._bounded[old]
         self._complete = True
         return True
 
@@ -384,6 +396,30 @@ class Session:
         if self._state is not None and self._state.header.step + 1 < self._next_step:
             self._state = None
         return False
+
+    def _take_feedback(self) -> None:
+        """Takes what the world has said of the answers; what it said of the last one came before the state that followed."""
+        for _ in range(_AT_ONCE):
+            sample = self._feedback.receive()
+            if sample is None:
+                break
+            header = s.FrameHeader.from_buffer_copy(sample.user_header().contents)
+            records = _copied(sample, s.Feedback)
+            fault = self._not_the_world(header, sample)
+            if fault is not None:
+                self._refuse(header, sample, fault)
+                continue
+            for told in map(feedback_of, records):
+                if told.rule == s.RULE_NONE:
+                    self._bounded.setdefault(told.step, {})[told.vehicle] = told
+                else:
+                    self.summary.refused += 1
+                    self._refusals.append(told)
+
+    def _world_gone(self) -> Error:
+        """Why a run is over that has had no end."""
+        refused = f"; it had refused an answer: {self._refusals[-1]}" if self._refusals else ""
+        return Error(f"the world (process {self.reply.world_process_id}) has ended without an end of the run{refused}")
 
     def _take_coordination(self, state: _State) -> None:
         """Takes coordination of the step at hand, as far as it has come."""
@@ -537,12 +573,15 @@ class Session:
             name = self.run.zone_names[zone]
             partners = self._partners[zone]
             # Of an older answer nothing says what was applied.
-            commanded = self._commanded if header.step == self._open_from else None
+            is_answered = header.step == self._open_from
+            commanded = self._commanded if is_answered else None
+            bounded = self._bounded.get(header.step - 1) if is_answered else None
             skipped = self._skipped(header)
             records_ = frozen(frame[start:end])
             views.append(
                 ZoneView(
-                    self.run, zone, name, header, records_, places, partners, part, frozen(frame), skipped, commanded
+                    self.run, zone, name, header, records_, places, partners, part, frozen(frame), skipped, commanded,
+                    bounded, self._refusals,
                 )
             )
             at += len(own)
@@ -572,12 +611,14 @@ class Session:
         out = None
         reached = loan.assume_init().send()
         self._open_from = header.step + 1
+        # Another list: the views may be kept.
+        self._refusals = []
         self.summary.answered += 1
         self._state = None
         self._complete = False
         # Nobody has room for an answer that is too late, and nobody is there once the world has gone.
         if reached == 0 and not _alive(self.reply.world_process_id):
-            raise Error(f"the world (process {self.reply.world_process_id}) has ended without an end of the run")
+            raise self._world_gone()
 
     def close(self) -> None:
         """Leaves the run. Whoever leaves last removes what iceoryx2 leaves behind."""
@@ -586,7 +627,7 @@ class Session:
         # There is no summary in which it could stand.
         for line in self.refused():
             print(line, file=sys.stderr)
-        self._state = self._states = self._coordination = self._members = self._commands = None
+        self._state = self._states = self._coordination = self._members = self._feedback = self._commands = None
         self._replies = self._requests = self._node = None
         try:
             # Whoever is in the run holds this lock too.

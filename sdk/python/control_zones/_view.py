@@ -24,6 +24,86 @@ if typing.TYPE_CHECKING:
     Flags = NDArray[numpy.bool_]
 
 NAN = float("nan")
+
+
+class Feedback(typing.NamedTuple):
+    """What became of a command (`row` is not 0), or why a frame was refused (`rule` is not 0)."""
+
+    #: `row`: what was to be applied, m/s^2. `rule`: what the field held (0 where it is no number).
+    value: float
+    #: The least and the greatest that was allowed; the shield's, where `row` says so.
+    least: float
+    greatest: float
+    #: Step of the command; the vehicle, its zone (`schemas.NO_VEHICLE`, `NO_ZONE` where it is about none).
+    step: int
+    vehicle: int
+    zone: int
+    #: `row`: the vehicle toward which, or `schemas.NO_VEHICLE`.
+    toward: int
+    #: `rule`: place in the frame of the record at fault.
+    record: int
+    #: What bounded the command: `schemas.ROW_MERGE` and its like.
+    row: int
+    #: What was broken, `schemas.RULE_LIMITS` and its like, and by which field, `schemas.FIELD_U_MPS2` and its like.
+    rule: int
+    field: int
+
+    @property
+    def row_name(self) -> str:
+        return _named("ROW_", self.row)
+
+    @property
+    def rule_name(self) -> str:
+        return _named("RULE_", self.rule)
+
+    @property
+    def field_name(self) -> str:
+        return _named("FIELD_", self.field)
+
+    def __str__(self) -> str:
+        return f"step {self.step}: {self._words()}"
+
+    def _words(self) -> str:
+        vehicle, value, least, greatest = self.vehicle, *map(_number, (self.value, self.least, self.greatest))
+        if self.row == s.ROW_LIMITS:
+            return f"u_mps2 of vehicle {vehicle} was not within its limits, {greatest} taken"
+        if self.row != s.ROW_NONE:
+            toward = "" if self.toward == s.NO_VEHICLE else f" toward {self.toward}"
+            return f"vehicle {vehicle} was to have {value} m/s^2, at most {greatest} by {self.row_name}{toward}"
+        known = {
+            s.RULE_UNKNOWN: f"vehicle {vehicle} is in no zone",
+            s.RULE_FOREIGN: f"vehicle {vehicle} is driven by another controller",
+            s.RULE_TWICE: f"vehicle {vehicle} is commanded twice",
+            s.RULE_MISSING: f"vehicle {vehicle} has no command at place {self.record} of the frame",
+            s.RULE_UNASKED: "nobody asked for this answer",
+        }.get(self.rule)
+        if known is not None:
+            return known
+        field = self.field_name if vehicle == s.NO_VEHICLE else f"{self.field_name} of vehicle {vehicle}"
+        if self.rule == s.RULE_NOT_FINITE:
+            return f"{field} is no number"
+        if self.rule == s.RULE_LIMITS:
+            bound = f"at most {greatest}" if self.value > self.greatest else f"at least {least}"
+            return f"{field} is {value}, {bound} allowed"
+        if self.field in (s.FIELD_RUN_ID, s.FIELD_SCHEMA_HASH, s.FIELD_SENDER):
+            return f"{field} is not the one expected"
+        return f"{field} is {value}, expected {least}"
+
+
+def feedback_of(record: s.Feedback) -> Feedback:
+    """A record as it came."""
+    return Feedback(*(getattr(record, name) for name in Feedback._fields))
+
+
+def _number(value: float) -> str:
+    return repr(float(value)).removesuffix(".0")
+
+
+def _named(prefix: str, code: int) -> str:
+    names = (name for name, value in vars(s).items() if name.startswith(prefix) and value == code)
+    return next(names, f"{prefix}{code}").removeprefix(prefix).lower()
+
+
 #: What is shown of a partner.
 _PARTNER_FIELDS = ("x_m", "v_mps", "u_mps2", "planned_exit_time_s", "planned_exit_speed_mps")
 
@@ -56,6 +136,10 @@ class ZoneView:
         entered: whether each vehicle has entered the zone in the step just ended.
         commanded: what this controller commanded each vehicle for the step just ended, m/s^2; NaN where it did not. What
             was applied is `u`, and the rest is the shield's, or what the speed limit allowed.
+        bounded: for each vehicle what the shield found of that command where it did not let it pass, a `Feedback`, else None:
+            `row` says what bounded it, `toward` which vehicle, and `greatest` is what it allowed, m/s^2.
+        refusals: answers of this controller that the world refused since the last one it took, of all its zones, each a
+            `Feedback` with field and rule.
         states: all records of the zone, index 0 (the vehicle that left it last) included.
         own: of each of those, whether it is a vehicle to be commanded.
         frame: the records of all zones.
@@ -76,6 +160,7 @@ class ZoneView:
     commands: typing.Any
     missed: bool
     skipped: int
+    refusals: list[Feedback]
 
     def __init__(
         self,
@@ -90,6 +175,8 @@ class ZoneView:
         frame: typing.Any = None,
         skipped: int = 0,
         commanded: dict[int, float] | None = None,
+        bounded: dict[int, Feedback] | None = None,
+        refusals: list[Feedback] | None = None,
     ) -> None:
         self.run = run
         self.zone = zone
@@ -103,6 +190,8 @@ class ZoneView:
         self.missed = bool(header.flags & s.FLAG_MISSED)
         self.skipped = skipped
         self._commanded = commanded or {}
+        self._bounded = bounded or {}
+        self.refusals = refusals or []
         self._own = own
         self._partners = partners
         self._cache: dict[object, Floats] = {}
@@ -188,6 +277,10 @@ class ZoneView:
     def commanded(self) -> Floats:
         known = self._commanded
         return self._once("commanded", lambda: _array([known.get(int(v), NAN) for v in self.vehicle]))
+
+    @property
+    def bounded(self) -> list[Feedback | None]:
+        return [self._bounded.get(int(v)) for v in self.vehicle]
 
     @property
     def length(self) -> Floats:

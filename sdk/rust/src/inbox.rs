@@ -21,11 +21,11 @@ pub(crate) struct Inbox<R: Record> {
     subscriber: Subscriber<ipc::Service, [R], FrameHeader>,
     /// Knows the ports of the service.
     factory: PortFactory<ipc::Service, [R], FrameHeader>,
-    service: &'static str,
+    service: String,
 }
 
 impl<R: Record> Inbox<R> {
-    pub(crate) fn open(node: &Node<ipc::Service>, service: &'static str) -> Result<Inbox<R>, Error> {
+    pub(crate) fn open(node: &Node<ipc::Service>, service: &str) -> Result<Inbox<R>, Error> {
         let factory = node
             .service_builder(&name(service)?)
             .publish_subscribe::<[R]>()
@@ -36,7 +36,7 @@ impl<R: Record> Inbox<R> {
             .subscriber_builder()
             .create()
             .map_err(|e| failed(&format!("subscribe to {service}"), &e))?;
-        Ok(Inbox { subscriber, factory, service })
+        Ok(Inbox { subscriber, factory, service: service.to_owned() })
     }
 
     /// The next frame, if there is one.

@@ -19,6 +19,8 @@ pub use ipc_schemas as schemas;
 pub use session::{Commands, Session, Wake};
 pub use view::{Partner, PartnerKind, Path, Run, Step, Summary, Vehicle};
 
+pub use ipc_schemas::Feedback;
+
 use ipc_schemas::VehicleCommand;
 use std::time::Duration;
 
@@ -47,6 +49,16 @@ pub enum Error {
     /// The world is no longer there.
     #[error("the world (process {0}) has ended without an end of the run")]
     WorldGone(u32),
+    /// The world is no longer there, and had refused this controller's answer.
+    #[error(
+        "the world (process {process_id}) has ended without an end of the run; it had refused an answer: {refusal}"
+    )]
+    AnswerRefused {
+        /// The world's process.
+        process_id: u32,
+        /// What was wrong with the answer.
+        refusal: Feedback,
+    },
     /// The reply to the attach request cannot be read.
     #[error(
         "the world's reply has {0} bytes, which are not what it should say; build both from the same version"

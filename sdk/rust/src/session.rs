@@ -11,8 +11,8 @@ use iceoryx2::prelude::AllocationStrategy;
 use iceoryx2::sample_mut::SampleMut;
 use iceoryx2::service::ipc;
 use ipc_schemas::{
-    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, FrameHeader,
-    HeaderFault, Member, Role, VehicleCommand, VehicleState,
+    self as frames, Assignment, AttachReply, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, Feedback,
+    FrameHeader, HeaderFault, Member, Role, VehicleCommand, VehicleState,
 };
 use std::time::{Duration, Instant};
 
@@ -44,13 +44,14 @@ pub struct Session {
     states: Inbox<VehicleState>,
     coordination: Inbox<Assignment>,
     members: Inbox<Member>,
+    feedback: Inbox<Feedback>,
     commands: Publisher<ipc::Service, [VehicleCommand], FrameHeader>,
     line: attach::Line,
     _space: Space,
     run: Run,
     reply: AttachReply,
-    /// The sending ends that have proved to be the world's: of states, and of who has which place.
-    world_origins: [Option<u128>; 2],
+    /// The sending ends that have proved to be the world's: of states, of who has which place, and of feedback.
+    world_origins: [Option<u128>; 3],
     coordinators: Vec<Seat>,
     /// The first step whose coordination is not in force yet.
     next_step: u64,
@@ -63,6 +64,10 @@ pub struct Session {
     refusals: Refusals,
     /// Accelerations of the last answer, by vehicle, ascending.
     commanded: Vec<(u32, f64)>,
+    /// What the shield found of commands, by vehicle, ascending.
+    bounded: Vec<Feedback>,
+    /// Answers that were refused since the last one.
+    told_refusals: Vec<Feedback>,
     summary: Summary,
 }
 
@@ -107,6 +112,7 @@ impl Session {
         let states = Inbox::open(node, frames::SERVICE_STATE)?;
         let coordination = Inbox::open(node, frames::SERVICE_COORDINATION)?;
         let members = Inbox::open(node, frames::SERVICE_MEMBERS)?;
+        let feedback = Inbox::open(node, &format!("{}{}", frames::SERVICE_FEEDBACK_PREFIX, reply.index))?;
         let commands = node
             .service_builder(&name(frames::SERVICE_COMMAND)?)
             .publish_subscribe::<[VehicleCommand]>()
@@ -129,6 +135,7 @@ impl Session {
             states,
             coordination,
             members,
+            feedback,
             commands,
             line,
             _space: space,
@@ -139,10 +146,12 @@ impl Session {
             board,
             refusals: Refusals::default(),
             commanded: Vec::new(),
+            bounded: Vec::new(),
+            told_refusals: Vec::new(),
             summary: Summary::default(),
             run,
             reply,
-            world_origins: [None; 2],
+            world_origins: [None; 3],
             coordinators: Vec::new(),
         })
     }
@@ -173,9 +182,11 @@ impl Session {
             }
             if waited >= checked + LIFE_CHECK {
                 checked = waited;
+                // Of a world that has ended nothing more can be had.
+                self.take_feedback()?;
                 if !is_alive(self.reply.world_process_id) {
                     // Its last frame may have come in the meantime.
-                    return self.poll()?.ok_or(Error::WorldGone(self.reply.world_process_id));
+                    return self.poll()?.ok_or_else(|| self.world_gone());
                 }
             }
             if waited >= BUSY {
@@ -212,6 +223,8 @@ impl Session {
             self.summary.skipped += header.step.saturating_sub(self.open_from);
         }
         self.saw(&header);
+        self.take_feedback()?;
+        self.bounded.retain(|f| f.step.saturating_add(1) >= header.step);
         let Some(state) = self.pending.as_ref() else { return Ok(None) };
         self.board.muster(&self.run, state.frame.payload());
         self.is_complete = true;
@@ -259,7 +272,7 @@ impl Session {
         let AttachReply { run_id, world_process_id: expected, .. } = self.reply;
         ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
             .check(header, records)?;
-        let [known, _] = &mut self.world_origins;
+        let [known, ..] = &mut self.world_origins;
         prove(known, origin, expected, || self.states.process_of(origin))
     }
 
@@ -295,8 +308,51 @@ impl Session {
         let AttachReply { run_id, world_process_id: expected, .. } = self.reply;
         ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
             .check(header, records)?;
-        let [_, known] = &mut self.world_origins;
+        let [_, known, _] = &mut self.world_origins;
         prove(known, origin, expected, || self.members.process_of(origin))
+    }
+
+    /// Takes what the world has said of the answers; what it said of the last one came before the state that followed.
+    fn take_feedback(&mut self) -> Result<(), Error> {
+        for _ in 0..AT_ONCE {
+            let Some(frame) = self.feedback.receive()? else { break };
+            let header = *frame.user_header();
+            let told = frame.payload().to_vec();
+            let origin = frame.origin().value();
+            drop(frame);
+            if let Err(refusal) = self.judge_feedback(&header, origin, told.len()) {
+                let feedback = &self.feedback;
+                self.refusals.enter(&header, origin, refusal, || feedback.process_of(origin));
+                continue;
+            }
+            for told in told {
+                if told.rule == frames::RULE_NONE {
+                    self.bounded.push(told);
+                } else {
+                    self.summary.refused += 1;
+                    self.told_refusals.push(told);
+                }
+            }
+        }
+        self.bounded.sort_unstable_by_key(|f| (f.step, f.vehicle));
+        Ok(())
+    }
+
+    fn judge_feedback(&mut self, header: &FrameHeader, origin: u128, records: usize) -> Result<(), Refusal> {
+        let AttachReply { run_id, world_process_id: expected, .. } = self.reply;
+        ExpectedHeader { run_id, role: Role::World, index: 0, generation: 0, step: header.step }
+            .check(header, records)?;
+        let [.., known] = &mut self.world_origins;
+        prove(known, origin, expected, || self.feedback.process_of(origin))
+    }
+
+    /// Why a run is over that has had no end.
+    fn world_gone(&self) -> Error {
+        let process_id = self.reply.world_process_id;
+        match self.told_refusals.last() {
+            Some(refusal) => Error::AnswerRefused { process_id, refusal: *refusal },
+            None => Error::WorldGone(process_id),
+        }
     }
 
     /// Takes coordination of the step at hand, as far as it has come.
@@ -417,9 +473,23 @@ impl Session {
             },
             // Of an older answer nothing says what was applied.
             commanded: if state.header.step == self.open_from { &self.commanded } else { &[] },
+            bounded: if state.header.step == self.open_from {
+                self.bounded_before(state.header.step)
+            } else {
+                &[]
+            },
+            refusals: &self.told_refusals,
             run: &self.run,
             board: &self.board,
         }
+    }
+
+    /// What the shield found of the commands before a step.
+    fn bounded_before(&self, step: u64) -> &[Feedback] {
+        let is_older = |f: &Feedback| f.step.saturating_add(1) < step;
+        let from = self.bounded.partition_point(is_older);
+        let count = self.bounded[from..].partition_point(|f| f.step.saturating_add(1) == step);
+        &self.bounded[from..from + count]
     }
 
     /// What the run has been so far, as this controller saw it.
@@ -479,8 +549,9 @@ impl Session {
         let reached = commands.0.send().map_err(|e| failed("send commands", &e))?;
         // Nobody has room for an answer that is too late, and nobody is there once the world has gone.
         if reached == 0 && !is_alive(self.reply.world_process_id) {
-            return Err(Error::WorldGone(self.reply.world_process_id));
+            return Err(self.world_gone());
         }
+        self.told_refusals.clear();
         self.summary.answered += 1;
         self.open_from = self.pending.as_ref().map_or(0, |state| state.header.step.saturating_add(1));
         self.pending = None;

@@ -1,8 +1,8 @@
 //! What a controller sees.
 
 use ipc_schemas::{
-    self as frames, ASSIGNMENT_FREE_TERMINAL, Assignment, FrameHeader, KindSpec, PATH_OWN, PathSpec, RunSpec,
-    VehicleState,
+    self as frames, ASSIGNMENT_FREE_TERMINAL, Assignment, Feedback, FrameHeader, KindSpec, PATH_OWN,
+    PathSpec, RunSpec, VehicleState,
 };
 use std::ops::Range;
 
@@ -95,6 +95,8 @@ pub struct Summary {
     pub skipped: u64,
     /// Of the states seen, those before which the world had put something in for a controller that was late.
     pub missed: u64,
+    /// Answers that the world refused, as far as it said so: once in a step.
+    pub refused: u64,
 }
 
 /// One vehicle to be commanded: places in the state frame and in its zone's assignments.
@@ -228,6 +230,10 @@ pub struct Step<'a> {
     pub skipped: u64,
     /// What this controller commanded for the step just ended, by vehicle, ascending.
     pub(crate) commanded: &'a [(u32, f64)],
+    /// What the shield found of these commands, by vehicle, ascending.
+    pub(crate) bounded: &'a [Feedback],
+    /// Answers of this controller that the world refused since the last one it took, with field and rule.
+    pub refusals: &'a [Feedback],
     pub(crate) run: &'a Run,
     pub(crate) board: &'a Board,
 }
@@ -240,7 +246,7 @@ impl<'a> Step<'a> {
 
     /// The vehicles to be commanded, in the order of the commands.
     pub fn vehicles(&self) -> impl Iterator<Item = Vehicle<'a>> + use<'a> {
-        let Step { run, states, board, commanded, .. } = *self;
+        let Step { run, states, board, commanded, bounded, .. } = *self;
         board.members.iter().map(move |member| {
             let zone = &board.zones[member.zone as usize];
             let bound = member.assignments.start as usize..member.assignments.end as usize;
@@ -250,6 +256,10 @@ impl<'a> Step<'a> {
                 state,
                 place: (member.at - member.slice.start) as usize,
                 commanded_mps2: known.ok().map(|at| commanded[at].1),
+                bounded: bounded
+                    .binary_search_by_key(&state.vehicle, |f| f.vehicle)
+                    .ok()
+                    .map(|at| &bounded[at]),
                 length_m: run.path(member.zone, member.path).map_or(f64::NAN, |a| a.spec.length_m),
                 assignments: &zone.assignments[bound.clone()],
                 partners: &zone.partners[bound],
@@ -269,6 +279,9 @@ pub struct Vehicle<'a> {
     /// What this controller commanded it for the step just ended, m/s^2, if it did: `state.u_mps2` is what was applied,
     /// and the rest is the shield's, or what the speed limit allowed.
     pub commanded_mps2: Option<f64>,
+    /// What the shield found of that command, if it did not let it pass: `row` says what bounded it, `toward` which vehicle, and
+    /// `greatest` is what it allowed, m/s^2.
+    pub bounded: Option<&'a Feedback>,
     /// Length of its path, m.
     pub length_m: f64,
     /// Its constraints, as the coordinator sent them.
@@ -426,8 +439,9 @@ mod tests {
 
     fn seen(run: &Run, states: &[VehicleState], board: &Board) -> Vec<Found> {
         let header = FrameHeader::default();
-        let (missed, skipped, commanded) = (false, 0, &[][..]);
-        let step = Step { header: &header, time_s: 0.0, states, missed, skipped, commanded, run, board };
+        let (missed, skipped, commanded, bounded, refusals) = (false, 0, &[][..], &[][..], &[][..]);
+        let (header, time_s) = (&header, 0.0);
+        let step = Step { header, time_s, states, missed, skipped, commanded, bounded, refusals, run, board };
         let partners = |v: &Vehicle<'_>| v.partners().map(|p| (p.state.vehicle, p.x_m)).collect();
         step.vehicles().map(|v| (v.state.vehicle, v.length_m, partners(&v))).collect()
     }

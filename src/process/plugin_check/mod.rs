@@ -13,7 +13,7 @@ pub use rules::{Breach, Report, Rule};
 
 use super::attach::{Readiness, Reception};
 use super::plugin_child::PluginChild;
-use super::services::MembersOutbox;
+use super::services::{MembersOutbox, create_feedback};
 use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
@@ -74,6 +74,8 @@ pub fn check(
     let coordination = space.create(frames::SERVICE_COORDINATION, limits(1, 3))?;
     let commands = space.create(frames::SERVICE_COMMAND, limits(3, 1))?;
     let members = space.create(frames::SERVICE_MEMBERS, MembersOutbox::limits(3, 6))?;
+    // Held open, and silent: whatever is wrong stands in the report.
+    let _feedback = create_feedback(&space, INDEX)?;
     let run_id = 0x636f_6e66_6f72_6d00 | u64::from(std::process::id() & 0xff);
     let mut world = World::new(scenario.clone(), 1);
     world.share_out(INDEX + 1);
