@@ -10,8 +10,8 @@
 //! waiter sleeps at once for some waits, more each time; where it pays, for fewer.
 //!
 //! A core is crowded when a spinning waiter finds a hole in its own time, or a yield takes as long as others'
-//! turns do. Nothing else here knows of others but one look at the number of processes that want to run, at
-//! first and before the core is taken to be free again.
+//! turns do: one such turn costs as much as a thousand steps. Before it is taken to be free again, the cores must have
+//! had idle time, which they have among waiters that sleep, and have not beside work that never ends.
 //!
 //! Times are nanoseconds on one clock, and are given; so the policy can be tested without waiting.
 
@@ -72,6 +72,9 @@ struct Crowd {
     until: u64,
     hold_ns: u64,
     is_there: bool,
+    /// When the idle time of the cores was asked for last, and what it was.
+    asked: u64,
+    idle_ns: u64,
 }
 
 const US: u64 = 1_000;
@@ -94,11 +97,12 @@ const TURN: u64 = 500 * US;
 const WAKE_COST: u64 = 20 * US;
 const LEAST_WAKE_COST: u64 = 4 * US;
 const GREATEST_WAKE_COST: u64 = 100 * US;
-/// How long a core is taken for crowded after it was seen to be, at least and at most.
-const LEAST_HOLD: u64 = 20 * MS;
-const GREATEST_HOLD: u64 = 1_000 * MS;
-/// How long because more processes want to run than there are cores.
-const ASK_AGAIN: u64 = 500 * US;
+/// How long a core is taken for crowded after it was seen to be, at least and at most. Idle time is told in units of
+/// 10 ms.
+const LEAST_HOLD: u64 = 100 * MS;
+const GREATEST_HOLD: u64 = 2_000 * MS;
+/// The cores are free when together they have been idle for more than the time that has passed, by this.
+const IDLE_SHARE: u64 = 8;
 /// Polling in vain so many times in a row on a free core makes sleep come at once.
 const IN_VAIN: u32 = 3;
 /// For so many waits at most.
@@ -109,8 +113,7 @@ impl WaitPolicy {
         WaitPolicy {
             situation,
             wake_cost_ns: WAKE_COST,
-            // Unknown: the first look asks.
-            crowd: Crowd { until: 0, hold_ns: LEAST_HOLD, is_there: true },
+            crowd: Crowd { until: 0, hold_ns: LEAST_HOLD, is_there: false, asked: 0, idle_ns: 0 },
             in_vain: 0,
             sleeps_left: 0,
             sleeps: 1,
@@ -124,8 +127,8 @@ impl WaitPolicy {
     }
 
     /// The waiter looks up: what now? `gives_way` when it waits for a process that has just been woken, perhaps
-    /// on this core; `is_busy` tells whether more processes want to run than the machine has cores.
-    pub(super) fn look(&mut self, now: u64, gives_way: bool, is_busy: impl Fn() -> bool) -> Advice {
+    /// on this core; `idle_ns` tells how long the cores have been idle so far.
+    pub(super) fn look(&mut self, now: u64, gives_way: bool, idle_ns: impl Fn() -> u64) -> Advice {
         let mut wait = self.wait.unwrap_or(Wait {
             since: now,
             last_look: now,
@@ -137,12 +140,12 @@ impl WaitPolicy {
         });
         let away = now.saturating_sub(wait.last_look);
         match wait.last {
-            Advice::Spin if away > HOLE => self.crowd.seen(now),
-            Advice::Yield if away > TURN => self.crowd.seen(now),
+            Advice::Spin if away > HOLE => self.crowd.seen(now, &idle_ns),
+            Advice::Yield if away > TURN => self.crowd.seen(now, &idle_ns),
             Advice::Yield if away > SHARED && !self.needs_core(wait.gives_way) => wait.slept = true,
             _ => {}
         }
-        let is_crowded = self.crowd.is_there(now, is_busy);
+        let is_crowded = self.crowd.is_there(now, &idle_ns);
         let advice = self.advise(&mut wait, now, gives_way, is_crowded);
         self.wait = Some(Wait { last: advice, last_look: now, ..wait });
         advice
@@ -223,23 +226,26 @@ impl WaitPolicy {
 }
 
 impl Crowd {
-    fn seen(&mut self, now: u64) {
+    fn seen(&mut self, now: u64, idle_ns: impl Fn() -> u64) {
         if !self.is_there {
             // Back soon after it was taken to be gone: it is here to stay.
             let soon = now < self.until + 4 * self.hold_ns;
             self.hold_ns =
                 if soon && self.until > 0 { (2 * self.hold_ns).min(GREATEST_HOLD) } else { LEAST_HOLD };
+            (self.asked, self.idle_ns) = (now, idle_ns());
         }
         self.is_there = true;
         self.until = now + self.hold_ns;
     }
 
-    fn is_there(&mut self, now: u64, is_busy: impl Fn() -> bool) -> bool {
+    fn is_there(&mut self, now: u64, idle_ns: impl Fn() -> u64) -> bool {
         if self.is_there && now >= self.until {
-            if is_busy() {
-                self.until = now + ASK_AGAIN;
-            } else {
-                self.is_there = false;
+            let idle_ns = idle_ns();
+            let idle_since_ns = idle_ns.saturating_sub(self.idle_ns);
+            self.is_there = idle_since_ns < (now - self.asked) / IDLE_SHARE;
+            if self.is_there {
+                (self.asked, self.idle_ns) = (now, idle_ns);
+                self.until = now + self.hold_ns;
             }
         }
         self.is_there
@@ -276,8 +282,9 @@ mod tests {
         }
 
         fn look(&mut self, gives_way: bool) -> Advice {
-            let is_busy = self.is_busy;
-            self.policy.look(self.now, gives_way, || is_busy)
+            // A core is idle for half of the time, or never.
+            let idle_ns = if self.is_busy { 0 } else { self.now / 2 };
+            self.policy.look(self.now, gives_way, || idle_ns)
         }
 
         /// A wait for a frame that comes after `ns`; polls are 1 us apart, yields take as long as `turn`.
@@ -366,6 +373,7 @@ mod tests {
         let mut random = 1_u64;
         for early_of_100 in [0, 10, 50, 90, 100] {
             let mut scene = Scene::new(ALONE, true);
+            scene.is_preempted(3 * MS);
             let (mut ours, mut spinning, mut sleeping) = (0, 0, 0);
             for _ in 0..20_000 {
                 random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
