@@ -1,4 +1,4 @@
-//! Lower bounds: each vehicle alone against the reference and against descent, pairs that merge against the
+//! Lower bounds: each vehicle alone against the reference and against descent, groups that merge against the
 //! centralised optimum of both orders.
 
 #![allow(clippy::unwrap_used)] // in helpers as in the tests themselves
@@ -119,16 +119,16 @@ fn no_other_profile_is_cheaper() {
     }
 }
 
-/// A run of two vehicles that arrive on the given roads at the given instants.
-fn two(roads: [&str; 2], instants_s: [f64; 2]) -> (Arc<control_zones::scenario::Scenario>, Sample) {
+/// A run of vehicles that arrive on the given roads at the given instants.
+fn run_of(arrivals: &[(&str, f64)]) -> (Arc<control_zones::scenario::Scenario>, Sample) {
     let dir = tempfile::tempdir().unwrap();
-    let trace = dir.path().join("two.csv");
-    let rows: Vec<String> = (0..2).map(|i| format!("{},{},16\n", instants_s[i], roads[i])).collect();
+    let trace = dir.path().join("few.csv");
+    let rows: Vec<String> = arrivals.iter().map(|(road, at_s)| format!("{at_s},{road},16\n")).collect();
     std::fs::write(&trace, format!("time_s,road,speed_mps\n{}", rows.concat())).unwrap();
     let set = format!("roads.*.demand={{ trace = \"{}\" }}", trace.display()).parse().unwrap();
     let flow = "zones.*.flow={ policy = \"none\" }".parse().unwrap();
     let scenario = Arc::new(load(Some("paper"), &[set, flow], Some(1)).unwrap());
-    let sample = Sample::of(&scenario, "two vehicles").unwrap();
+    let sample = Sample::of(&scenario, "few vehicles").unwrap();
     (scenario, sample)
 }
 
@@ -140,7 +140,7 @@ fn pairs_that_merge_cost_at_least_their_bound() {
         (["main1", "merge1"], [1.0, 1.9]),
         (["main1", "merge2"], [1.0, 11.3]),
     ] {
-        let (scenario, sample) = two(roads, instants_s);
+        let (scenario, sample) = run_of(&[(roads[0], instants_s[0]), (roads[1], instants_s[1])]);
         let entrants = sample.entrants();
         let traffic = Traffic { scenario: &scenario, entrants: &entrants };
         let bound = merging::bound(&traffic).unwrap();
@@ -156,16 +156,52 @@ fn pairs_that_merge_cost_at_least_their_bound() {
             courses[ahead].iter_mut().for_each(|course| course.exit_s += 6.0);
         }
         let least = orders[0].min(orders[1]);
-        assert_eq!(bound.pairs, 1, "{roads:?}");
+        assert_eq!(bound.groups, 1, "{roads:?}");
         assert!(alone + 1e-4 < bound.total, "{alone} {bound:?}");
         assert!(bound.total <= least + 1e-9, "{bound:?} {orders:?}");
         // The duality gap, the cells, and the stretches of the centralised optimum.
         assert!(bound.total > alone + 0.5 * (least - alone), "{alone} {bound:?} {orders:?}");
     }
     // Far apart nobody has to merge.
-    let (scenario, sample) = two(["main1", "merge1"], [1.0, 15.0]);
+    let (scenario, sample) = run_of(&[("main1", 1.0), ("merge1", 15.0)]);
     let entrants = sample.entrants();
     let traffic = Traffic { scenario: &scenario, entrants: &entrants };
-    assert_eq!(merging::bound(&traffic).unwrap().pairs, 0);
+    assert_eq!(merging::bound(&traffic).unwrap().groups, 0);
     assert_eq!(traffic.bounds().merging_total, Some(traffic.alone().total));
+}
+
+#[test]
+fn three_that_merge_cost_at_least_their_bound_and_more_than_a_pair_of_them() {
+    for instants_s in [[1.0, 1.7, 2.4], [1.0, 2.2, 2.6]] {
+        // One comes from the ramp, first, between the others or last.
+        let arrivals = [("main1", instants_s[0]), ("merge1", instants_s[1]), ("main1", instants_s[2])];
+        let (scenario, sample) = run_of(&arrivals);
+        let entrants = sample.entrants();
+        let traffic = Traffic { scenario: &scenario, entrants: &entrants };
+        let bound = merging::bound(&traffic).unwrap();
+        let alone = traffic.alone().total;
+        let from_the_ramp = entrants.iter().position(|e| e.way[0].1 != entrants[0].way[0].1).unwrap();
+        let totals = [-4.0, 0.0, 9.0].map(|later_s| {
+            let mut courses = sample.courses();
+            courses[from_the_ramp].iter_mut().for_each(|course| course.exit_s += later_s);
+            let found = joint::seek(&traffic, &courses, f64::INFINITY).unwrap();
+            assert!(found.missed_s < 1e-3, "{found:?}");
+            found.total
+        });
+        let least = totals.iter().copied().fold(f64::INFINITY, f64::min);
+        assert_eq!(bound.groups, 1);
+        assert!(bound.total <= least + 1e-9, "{bound:?} {totals:?}");
+        assert!(bound.total > alone + 0.5 * (least - alone), "{alone} {bound:?} {totals:?}");
+        // Any two of them cost less, even for three vehicles' worth of them.
+        for left_out in 0..3 {
+            let mut pair = arrivals.to_vec();
+            pair.remove(left_out);
+            let (scenario, sample) = run_of(&pair);
+            let entrants = sample.entrants();
+            let of_two = Traffic { scenario: &scenario, entrants: &entrants };
+            // Of means over two, what it is in means over three.
+            let more = (merging::bound(&of_two).unwrap().total - of_two.alone().total) * 2.0 / 3.0;
+            assert!(bound.total - alone > 1.5 * more, "{left_out}: {more} {alone} {bound:?}");
+        }
+    }
 }

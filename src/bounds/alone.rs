@@ -7,7 +7,7 @@
 //! `w_k u = -lambda` is linear in time, and as duration is free the Hamiltonian is zero:
 //! `pi_k - w_k u^2/2 + p_k v = 0`; at a leg's end `w u` is continuous, at the way's end it is zero where the speed is
 //! free. Backward from an exit speed each leg is therefore a cubic, and the entry speed grows with the exit speed (or,
-//! where that is given, falls with the acceleration at the end): bisection.
+//! where that is given, falls with the acceleration at the end): its root is sought between bounds.
 
 /// A stretch of the way.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -56,8 +56,10 @@ pub struct Optimum {
     pub exits_mps: Vec<f64>,
 }
 
-/// Bisections; each halves the interval.
-const HALVINGS: usize = 70;
+/// Steps of a search, at most: each third one halves the interval.
+const STEPS: usize = 200;
+/// By how much the entry speed may be missed, as a share of it.
+const MISS: f64 = 1e-13;
 /// Acceleration at an end whose speed is given, at most, m/s^2: beyond any that vehicles have.
 const HARDEST_MPS2: f64 = 64.0;
 
@@ -79,22 +81,43 @@ pub fn optimum(entry_mps: f64, legs: &[Leg], end: End) -> Option<Optimum> {
         }
     };
     // A vehicle that would have come to rest on the way has not come fast enough.
-    let is_slower = |sought: f64| extremal(sought).is_none_or(|(found_mps, _)| found_mps < entry_mps);
+    let excess_mps =
+        |sought: f64| extremal(sought).map_or(f64::NEG_INFINITY, |(found_mps, _)| found_mps - entry_mps);
     let (mut low, mut high) = match end {
         End::Speed(_) => (-HARDEST_MPS2, HARDEST_MPS2),
         _ => (0.0, entry_mps.max(1.0)),
     };
-    while is_slower(high) {
+    let (mut at_low, mut at_high) = (f64::NEG_INFINITY, excess_mps(high));
+    while at_high < 0.0 {
         if end != End::Free && high > 1e4 || matches!(end, End::Speed(_)) {
             return None;
         }
-        (low, high) = (high, 2.0 * high);
+        (low, at_low, high) = (high, at_high, 2.0 * high);
+        at_high = excess_mps(high);
     }
-    for _ in 0..HALVINGS {
+    // Between the two by regula falsi, where an end that has stayed counts less (Illinois).
+    let mut best = high;
+    let mut was_low = None;
+    for step in 0..STEPS {
         let middle = 0.5 * (low + high);
-        *(if is_slower(middle) { &mut low } else { &mut high }) = middle;
+        let secant = (low * at_high - high * at_low) / (at_high - at_low);
+        let is_within = secant > low && secant < high;
+        best = if step % 3 < 2 && at_low.is_finite() && is_within { secant } else { middle };
+        let excess = excess_mps(best);
+        if excess.abs() <= MISS * entry_mps || best <= low || best >= high {
+            break;
+        }
+        let is_low = excess < 0.0;
+        let again = if was_low == Some(is_low) { 0.5 } else { 1.0 };
+        if is_low {
+            (low, at_low, at_high) = (best, excess, again * at_high);
+        } else {
+            (high, at_high, at_low) = (best, excess, again * at_low);
+        }
+        was_low = Some(is_low);
     }
-    extremal(high).map(|(_, optimum)| optimum)
+    // Where rounding ends the search, from the side on which there is a way.
+    extremal(best).or_else(|| extremal(high)).map(|(_, optimum)| optimum)
 }
 
 /// The extremal that ends at a speed with `w u = momentum`: entry speed, and what it costs. `None` when it would

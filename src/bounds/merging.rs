@@ -1,13 +1,15 @@
 //! A rigorous bound that knows of merging, whatever the passing order.
 //!
-//! Vehicles are left alone but for disjoint pairs, of two that pass one merge: one passes it after the other, and then
-//! finds it at least `phi v + delta` further. A pair costs at least the lesser of its two orders, where both came by
-//! the same lanes that in which they came, and an order at least as much as its Lagrangian dual for any multiplier `mu >= 0` of
-//! `t_second(merge) >= t_first(merge + phi v + delta)`: with the second's speed `v` at the merge given, that is one
-//! vehicle whose time up to the merge is cheaper by `mu` and one whose time up to the further place is dearer by it,
-//! each alone and convex ([`super::alone`]). The second's cost is convex in `v^2`, the first's grows with `v`: cells
+//! Vehicles are left alone but for disjoint pairs, and [triples], of vehicles that pass one merge: one passes it after the
+//! other, and then finds it at least `phi v + delta` further. A pair costs at least the lesser of its two orders, where both
+//! came by the same lanes that in which they came, and an order at least as much as its Lagrangian dual for any multiplier
+//! `mu >= 0` of `t_second(merge) >= t_first(merge + phi v + delta)`: with the second's speed `v` at the merge given, that
+//! is one vehicle whose time up to the merge is cheaper by `mu` and one whose time up to the further place is dearer by
+//! it, each alone and convex ([`super::alone`]). The second's cost is convex in `v^2`, the first's grows with `v`: cells
 //! of `v` are bounded from below by the ends of the one and the lower end of the other, and split until they are small.
 //! What is left out (other vehicles, other places, limits) can only cost.
+
+mod triples;
 
 use super::alone::{End, Leg, Optimum, optimum};
 use super::traffic::{Entrant, Traffic, is_merge};
@@ -24,8 +26,8 @@ const TRIES: usize = 9;
 pub struct Merging {
     /// Of the sum of the zones' mean costs, m^2/s^3.
     pub total: f64,
-    /// Pairs that it is made of.
-    pub pairs: usize,
+    /// Pairs and triples that it is made of.
+    pub groups: usize,
 }
 
 /// One vehicle with the merge it is looked at.
@@ -62,7 +64,7 @@ pub fn bound(traffic: &Traffic<'_>) -> Option<Merging> {
         slip_mps: vehicle.u_max_mps2 * scenario.dt_s(),
     };
     let shares = traffic.shares();
-    let mut gains: Vec<(f64, u32, u32)> = Vec::new();
+    let mut groups = Vec::new();
     for zone in 0..scenario.network.zones.len() as u32 {
         let mut halves: Vec<(f64, Half<'_>)> = Vec::new();
         for entrant in traffic.entrants {
@@ -72,37 +74,27 @@ pub fn bound(traffic: &Traffic<'_>) -> Option<Merging> {
             halves.push((passes_s, half));
         }
         halves.sort_by(|a, b| a.0.total_cmp(&b.0));
-        for (at, (passes_s, own)) in halves.iter().enumerate() {
-            for (then_s, other) in &halves[at + 1..] {
-                // Further apart than any distance asked for takes at the speeds of vehicles alone.
-                if then_s - passes_s > 2.0 * setting.reaction_s + 0.2 * setting.gap_m {
-                    break;
-                }
-                let is_behind = own.has_come_the_way_of(other);
-                let least = match own.entrant.arrival_s < other.entrant.arrival_s {
-                    true if is_behind => setting.order(own, other),
-                    false if is_behind => setting.order(other, own),
-                    _ => setting.order(own, other).min(setting.order(other, own)),
-                };
-                let gain = least - own.alone.cost - other.alone.cost;
-                if gain > 0.0 {
-                    gains.push((gain, own.entrant.vehicle, other.entrant.vehicle));
-                }
-            }
-        }
+        groups.extend(setting.groups(&halves));
     }
-    // Any choice of disjoint pairs will do: the dearest first.
-    gains.sort_by(|a, b| b.0.total_cmp(&a.0));
+    // Any choice of disjoint groups will do: those of the most per vehicle first.
+    let per_vehicle = |group: &Group| group.gain / group.vehicles.len() as f64;
+    groups.sort_by(|a, b| per_vehicle(b).total_cmp(&per_vehicle(a)));
     let mut taken = std::collections::BTreeSet::new();
-    let mut merging = Merging { total: traffic.alone().total, pairs: 0 };
-    for (gain, a, b) in gains {
-        if !taken.contains(&a) && !taken.contains(&b) {
-            taken.extend([a, b]);
+    let mut merging = Merging { total: traffic.alone().total, groups: 0 };
+    for Group { gain, vehicles } in groups {
+        if vehicles.iter().all(|vehicle| !taken.contains(vehicle)) {
+            taken.extend(vehicles);
             merging.total += gain;
-            merging.pairs += 1;
+            merging.groups += 1;
         }
     }
     Some(merging)
+}
+
+/// Vehicles that cost more together than each alone.
+struct Group {
+    gain: f64,
+    vehicles: Vec<u32>,
 }
 
 impl Half<'_> {
@@ -126,6 +118,15 @@ impl Half<'_> {
         Half { entrant, before: legs[..=at].to_vec(), after: legs[at + 1..].to_vec(), alone }
     }
 
+    fn vehicle(&self) -> u32 {
+        self.entrant.vehicle
+    }
+
+    /// The greatest multiplier with which time up to the merge is no gain.
+    fn most(&self, setting: &Setting) -> f64 {
+        self.before.iter().map(|(_, weight)| weight * setting.beta).fold(f64::INFINITY, f64::min)
+    }
+
     /// Whether both have been on the same lanes all the way, so that nobody can have passed the other.
     fn has_come_the_way_of(&self, other: &Half<'_>) -> bool {
         self.entrant.way[..self.before.len()] == other.entrant.way[..other.before.len()]
@@ -133,31 +134,36 @@ impl Half<'_> {
 }
 
 impl Setting {
+    /// The groups at a merge, of vehicles sorted by when they would pass it alone.
+    fn groups(&self, halves: &[(f64, Half<'_>)]) -> Vec<Group> {
+        let mut groups = Vec::new();
+        for (at, (passes_s, own)) in halves.iter().enumerate() {
+            // Further apart than any distance asked for takes at the speeds of vehicles alone.
+            let reach_s = 2.0 * self.reaction_s + 0.2 * self.gap_m;
+            let near = halves[at + 1..].iter().take_while(|(then_s, _)| then_s - passes_s <= reach_s);
+            for (next, (_, other)) in near.enumerate() {
+                let pair = gain(&[own, other], |order, _| self.order(order[0], order[1]));
+                if pair <= 0.0 {
+                    continue;
+                }
+                groups.push(Group { gain: pair, vehicles: vec![own.vehicle(), other.vehicle()] });
+                if let (0, Some((third_s, third))) = (next, halves.get(at + 2))
+                    && third_s - passes_s <= reach_s
+                {
+                    let of_three = [own, other, third];
+                    let gain = gain(&of_three, |order, enough| self.order_of_three(order, enough));
+                    groups.push(Group { gain, vehicles: of_three.map(Half::vehicle).to_vec() });
+                }
+            }
+        }
+        groups
+    }
+
     /// At least what a pair costs in the order given.
     fn order(&self, first: &Half<'_>, second: &Half<'_>) -> f64 {
         let least = first.alone.cost + second.alone.cost;
-        // Time up to the merge must not become a gain.
-        let most = second.before.iter().map(|(_, weight)| weight * self.beta).fold(f64::INFINITY, f64::min);
-        // The dual is concave in its multiplier: golden section.
-        let ratio = 0.5 * (5f64.sqrt() - 1.0);
-        let (mut low, mut high) = (0.0, most);
-        let dual = |mu: f64| self.dual(first, second, mu);
-        let (mut a, mut b) = (high - ratio * (high - low), low + ratio * (high - low));
-        let (mut at_a, mut at_b) = (dual(a), dual(b));
-        let mut best = least.max(at_a).max(at_b);
-        for _ in 0..TRIES {
-            if at_a > at_b {
-                (high, b, at_b) = (b, a, at_a);
-                a = high - ratio * (high - low);
-                at_a = dual(a);
-            } else {
-                (low, a, at_a) = (a, b, at_b);
-                b = low + ratio * (high - low);
-                at_b = dual(b);
-            }
-            best = best.max(at_a).max(at_b);
-        }
-        best
+        let (_, most) = greatest((0.0, second.most(self)), TRIES, |mu| self.dual(first, second, mu));
+        least.max(most)
     }
 
     /// The dual, or less.
@@ -223,14 +229,21 @@ impl Setting {
 
     /// Cost of the one that passes first, its time up to the place that it must have reached dearer by `mu`.
     fn first(&self, half: &Half<'_>, mu: f64, speed_mps: f64) -> f64 {
+        let dearer =
+            |&(length_m, weight): &(f64, f64)| Leg { length_m, weight, price: weight * self.beta + mu };
+        let mut legs: Vec<Leg> = half.before.iter().map(dearer).collect();
+        let end = self.behind(half, mu, speed_mps, &mut legs);
+        optimum(half.entrant.speed_mps, &legs, end).map_or(f64::NEG_INFINITY, |found| found.cost)
+    }
+
+    /// Adds the legs behind the merge, with time dearer by `mu` up to where one who passes the merge after it, at that
+    /// speed, must find it.
+    fn behind(&self, half: &Half<'_>, mu: f64, speed_mps: f64, legs: &mut Vec<Leg>) -> End {
         let mut further_m = self.reaction_s * speed_mps + self.gap_m;
-        let mut legs: Vec<Leg> = Vec::new();
-        let dearer = |length_m: f64, weight: f64| Leg { length_m, weight, price: weight * self.beta + mu };
-        legs.extend(half.before.iter().map(|&(length_m, weight)| dearer(length_m, weight)));
         for &(length_m, weight) in &half.after {
             let part_m = further_m.min(length_m);
             if part_m > 0.0 {
-                legs.push(dearer(part_m, weight));
+                legs.push(Leg { length_m: part_m, weight, price: weight * self.beta + mu });
             }
             if length_m > part_m {
                 legs.push(Leg::new(length_m - part_m, weight, self.beta));
@@ -238,10 +251,71 @@ impl Setting {
             further_m -= part_m;
         }
         // Behind the network a vehicle keeps the speed it left with.
-        let end = match further_m > 0.0 {
+        match further_m > 0.0 {
             true => End::Coasting { length_m: further_m, faster_mps: self.slip_mps, price: mu },
             false => End::Free,
-        };
-        optimum(half.entrant.speed_mps, &legs, end).map_or(f64::NEG_INFINITY, |found| found.cost)
+        }
     }
+}
+
+/// By how much these cost more together than each alone, at least: `order` bounds what they cost in one order, and need not
+/// seek more than what is enough.
+fn gain<'h, const N: usize>(
+    halves: &[&'h Half<'h>; N],
+    mut order: impl FnMut([&'h Half<'h>; N], f64) -> f64,
+) -> f64 {
+    let alone: f64 = halves.iter().map(|half| half.alone.cost).sum();
+    let mut least = f64::INFINITY;
+    let mut each = |places: [usize; N]| {
+        let order_of = places.map(|place| halves[place]);
+        // Who came behind another on the same lanes passes behind it.
+        let overtakes = (0..N).any(|i| {
+            (i + 1..N).any(|j| {
+                let (before, after) = (order_of[i], order_of[j]);
+                before.entrant.arrival_s > after.entrant.arrival_s && before.has_come_the_way_of(after)
+            })
+        });
+        if !overtakes && least > alone {
+            least = least.min(order(order_of, least));
+        }
+    };
+    permutations(&mut std::array::from_fn(|place| place), 0, &mut each);
+    least - alone
+}
+
+/// All orders, the given one first.
+fn permutations<const N: usize>(places: &mut [usize; N], from: usize, each: &mut impl FnMut([usize; N])) {
+    if from == N {
+        return each(*places);
+    }
+    for at in from..N {
+        places.swap(from, at);
+        permutations(places, from + 1, each);
+        places.swap(from, at);
+    }
+}
+
+/// Where a concave function is greatest, nearly, and how great: golden section.
+fn greatest((mut low, mut high): (f64, f64), tries: usize, mut value: impl FnMut(f64) -> f64) -> (f64, f64) {
+    let ratio = 0.5 * (5f64.sqrt() - 1.0);
+    let (mut a, mut b) = (high - ratio * (high - low), low + ratio * (high - low));
+    let (mut at_a, mut at_b) = (value(a), value(b));
+    let mut best = if at_a > at_b { (a, at_a) } else { (b, at_b) };
+    for _ in 0..tries {
+        let new = if at_a > at_b {
+            (high, b, at_b) = (b, a, at_a);
+            a = high - ratio * (high - low);
+            at_a = value(a);
+            (a, at_a)
+        } else {
+            (low, a, at_a) = (a, b, at_b);
+            b = low + ratio * (high - low);
+            at_b = value(b);
+            (b, at_b)
+        };
+        if new.1 > best.1 {
+            best = new;
+        }
+    }
+    best
 }

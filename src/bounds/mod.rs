@@ -1,7 +1,7 @@
 //! What no controller can do better than, and what one that knew everything could do.
 //!
-//! [`alone`] is rigorous: each vehicle as if it were alone. So is [`merging`], which has pairs of vehicles meet at a
-//! merge, in whatever order. [`joint`] is the centralised optimum for a given
+//! [`alone`] is rigorous: each vehicle as if it were alone. So is [`merging`], which has pairs and triples of
+//! vehicles meet at a merge, in whatever order. [`joint`] is the centralised optimum for a given
 //! passing order, all vehicles at once: a local optimum, as the problem is not convex.
 
 pub mod alone;

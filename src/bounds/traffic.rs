@@ -31,7 +31,7 @@ pub struct Traffic<'a> {
 pub struct Bounds {
     /// Of the sum of the zones' mean costs, m^2/s^3.
     pub total: f64,
-    /// The same with pairs that merge, in whatever order; absent where the network has more than merges.
+    /// The same with pairs and triples that merge, in whatever order; absent where the network has more than merges.
     pub merging_total: Option<f64>,
     /// Of the mean cost per vehicle, m^2/s^3.
     pub per_vehicle: f64,

@@ -137,7 +137,7 @@ pub const ENERGY: Measure =
 pub const MEASURES: [Measure; 30] = [
     TOTAL,
     beside("alone_total", "bound: vehicles alone (rigorous)", None, 3, Pool::Mean, |r| Some(r.bounds.total)),
-    beside("merging_total", "bound: pairs that merge (rigorous)", None, 3, Pool::Mean, |r| {
+    beside("merging_total", "bound: groups that merge (rigorous)", None, 3, Pool::Mean, |r| {
         r.bounds.merging_total
     }),
     beside("joint_total", "centralised optimum (local)", None, 3, Pool::Mean, |r| {
@@ -152,7 +152,7 @@ pub const MEASURES: [Measure; 30] = [
     beside("of_alone", "total / vehicles alone (rigorous)", None, 3, Pool::Mean, |r| {
         Some(r.sample.total() / r.bounds.total)
     }),
-    beside("of_merging", "total / pairs that merge (rigorous)", None, 3, Pool::Mean, |r| {
+    beside("of_merging", "total / groups that merge (rigorous)", None, 3, Pool::Mean, |r| {
         Some(r.sample.total() / r.bounds.merging_total?)
     }),
     beside("of_joint", "total / centralised optimum (local)", None, 3, Pool::Mean, |r| {
