@@ -773,7 +773,7 @@ fn every_seed_runs_and_those_with_a_trace_have_it() {
     };
     for name in ["two-merges", "faulty-sensors"] {
         for seed in 1..=3 {
-            let path = format!("roads.main1.demand={{trace=\"data/arrivals_400_seed{seed}.csv\"}}");
+            let path = format!("roads.main1.demand={{trace=\"sumo-400-{seed}\"}}");
             let demand = (demand(name, seed, &[]), demand(name, 9, &[&path]));
             assert!(matches!(&demand.0, Demand::Trace(arrivals) if arrivals.len() > 30));
             assert_eq!(demand.0, demand.1);

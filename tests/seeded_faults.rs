@@ -196,8 +196,7 @@ fn the_table_has_a_line_only_when_there_are_faults() {
 #[test]
 fn another_seed_draws_other_faults() {
     // The same arrivals whatever the seed.
-    let trace =
-        ["main1", "merge1", "merge2"].map(|r| format!("roads.{r}.demand.trace=data/arrivals_400_seed1.csv"));
+    let trace = ["main1", "merge1", "merge2"].map(|r| format!("roads.{r}.demand.trace=sumo-400-1"));
     let sets: Vec<&str> = trace.iter().map(String::as_str).collect();
     let hash = |seed, more: &[&str]| {
         let sets = [&sets[..], &["end.vehicles=30"], more].concat();

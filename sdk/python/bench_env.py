@@ -24,7 +24,7 @@ import numpy
 from control_zones.env import ZonesEnv, ZoneVectorEnv
 
 ROOT = Path(__file__).resolve().parents[2]
-ARRIVALS = ROOT / "scenarios/data/arrivals_400_seed1.csv"
+ARRIVALS = ROOT / "scenarios/data/sumo-400-1.csv"
 SCENARIO, VEHICLES, DT_S, LENGTH_M = "paper", 120, 0.1, 200.0
 #: What SUMO's vehicles are told to hold.
 SPEED_MPS = 17.0

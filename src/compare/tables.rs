@@ -33,7 +33,7 @@ const ALL: [&str; 8] = [
 const DENSE: &str = "roads.*.demand={ rates = [{ until_s = 7200.0, vehicles_per_hour = 600.0 }], min_headway_s = 1.2, \
                      speed_mean_mps = 16.0, speed_sd_mps = 1.2, speed_min_mps = 10.0, speed_max_mps = 22.0 }";
 
-const TABLES: [Table; 7] = [
+const TABLES: [Table; 9] = [
     Table {
         name: "dev",
         scenarios: &["paper"],
@@ -49,6 +49,22 @@ const TABLES: [Table; 7] = [
         sets: &[],
         policies: &ALL,
         joint: Some("viable"),
+    },
+    Table {
+        name: "unseen",
+        scenarios: &["paper"],
+        seeds: SEEDED,
+        sets: &["roads.*.demand.trace=sumo-400-{seed}"],
+        policies: &ALL,
+        joint: None,
+    },
+    Table {
+        name: "unseen-varying",
+        scenarios: &["varying-demand"],
+        seeds: SEEDED,
+        sets: &["roads.*.demand.trace=sumo-varying-{seed}"],
+        policies: &ALL,
+        joint: None,
     },
     Table {
         name: "varying",

@@ -103,9 +103,7 @@ impl Patience {
         let manner = match mode {
             WaitMode::Block => Manner::ASLEEP,
             WaitMode::Adaptive | WaitMode::Hybrid if role == Role::Coordinator => Manner::ASLEEP,
-            WaitMode::Adaptive => {
-                Manner::Learned(WaitPolicy::new(Situation { shares_cores, may_yield }))
-            }
+            WaitMode::Adaptive => Manner::Learned(WaitPolicy::new(Situation { shares_cores, may_yield })),
             // More spinners than cores would only keep each other from working.
             WaitMode::Hybrid if shares_cores => Manner::Fixed { spin: Duration::ZERO, busy },
             WaitMode::Hybrid => Manner::Fixed { spin: SPIN, busy },

@@ -204,9 +204,9 @@ impl Replicate<'_> {
                     "roads.{road}.demand={{ rates = {rates}, min_headway_s = 1.2, speed_mean_mps = 16.0, \
                      speed_sd_mps = 1.2, speed_min_mps = 10.0, speed_max_mps = 22.0 }}"
                 )),
-                (Traffic::Varying, Demand::Traces) => sets.push(format!(
-                    "roads.{road}.demand={{ trace = \"data/arrivals_varying_seed{{seed}}.csv\" }}"
-                )),
+                (Traffic::Varying, Demand::Traces) => {
+                    sets.push(format!("roads.{road}.demand={{ trace = \"sumo-varying-{{seed}}\" }}"))
+                }
             }
         }
         let first = match (policy, traffic) {

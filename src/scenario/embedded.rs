@@ -16,40 +16,29 @@ pub(super) const SCENARIOS: [(&str, &str); 11] = [
 ];
 
 macro_rules! traces {
-    ($($path:literal),* $(,)?) => { [$(($path, include_str!(concat!("../../scenarios/", $path)))),*] };
+    ($($name:literal),* $(,)?) => {
+        [$(($name, include_str!(concat!("../../scenarios/data/", $name, ".csv")))),*]
+    };
 }
 
-/// Path as scenarios give it, and text.
-const TRACES: [(&str, &str); 6] = traces![
-    "data/arrivals_400_seed1.csv",
-    "data/arrivals_400_seed2.csv",
-    "data/arrivals_400_seed3.csv",
-    "data/arrivals_varying_seed1.csv",
-    "data/arrivals_varying_seed2.csv",
-    "data/arrivals_varying_seed3.csv",
+/// Name and text of arrival traces, which every scenario may use by name, wherever its file is. Those to 3 are what things
+/// were tuned on.
+#[rustfmt::skip]
+const TRACES: [(&str, &str); 46] = traces![
+    "sumo-400-1", "sumo-400-2", "sumo-400-3", "sumo-400-4", "sumo-400-5", "sumo-400-6", "sumo-400-7",
+    "sumo-400-8", "sumo-400-9", "sumo-400-10", "sumo-400-11", "sumo-400-12", "sumo-400-13", "sumo-400-14",
+    "sumo-400-15", "sumo-400-16", "sumo-400-17", "sumo-400-18", "sumo-400-19", "sumo-400-20", "sumo-400-21",
+    "sumo-400-22", "sumo-400-23", "sumo-varying-1", "sumo-varying-2", "sumo-varying-3", "sumo-varying-4",
+    "sumo-varying-5", "sumo-varying-6", "sumo-varying-7", "sumo-varying-8", "sumo-varying-9",
+    "sumo-varying-10", "sumo-varying-11", "sumo-varying-12", "sumo-varying-13", "sumo-varying-14",
+    "sumo-varying-15", "sumo-varying-16", "sumo-varying-17", "sumo-varying-18", "sumo-varying-19",
+    "sumo-varying-20", "sumo-varying-21", "sumo-varying-22", "sumo-varying-23",
 ];
+
+/// The names, as users read them.
+pub(super) const TRACE_NAMES: &str = "`sumo-400-1` to `-23`, `sumo-varying-1` to `-23`";
 
 /// Text of an embedded trace.
-pub(super) fn trace(path: &str) -> Option<&'static str> {
-    TRACES.iter().find(|(p, _)| *p == path).map(|(_, text)| *text)
-}
-
-/// Name and path of the embedded traces; by name every scenario may use them, wherever its file is.
-const NAMES: [(&str, &str); 6] = [
-    ("sumo-400-1", "data/arrivals_400_seed1.csv"),
-    ("sumo-400-2", "data/arrivals_400_seed2.csv"),
-    ("sumo-400-3", "data/arrivals_400_seed3.csv"),
-    ("sumo-varying-1", "data/arrivals_varying_seed1.csv"),
-    ("sumo-varying-2", "data/arrivals_varying_seed2.csv"),
-    ("sumo-varying-3", "data/arrivals_varying_seed3.csv"),
-];
-
-/// Text of an embedded trace, by its name.
-pub(super) fn named_trace(name: &str) -> Option<&'static str> {
-    NAMES.iter().find(|(n, _)| *n == name).and_then(|(_, path)| trace(path))
-}
-
-/// Names of all embedded traces.
-pub(super) fn trace_names() -> impl Iterator<Item = &'static str> {
-    NAMES.iter().map(|(name, _)| *name)
+pub(super) fn trace(name: &str) -> Option<&'static str> {
+    TRACES.iter().find(|(n, _)| *n == name).map(|(_, text)| *text)
 }

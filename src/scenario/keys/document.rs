@@ -52,7 +52,7 @@ is addressed by its `name` or its index from 0. The value is TOML, and what is n
     --set control.replan=from_state
     --set end.vehicles=400
     --set 'zones.merge-1.flow={policy=\"fixed\",terminal_mps=15}'
-    --set 'roads.0.demand.trace=data/arrivals_varying_seed{seed}.csv'
+    --set 'roads.0.demand.trace=sumo-varying-{seed}'
 ";
 
 /// All keys of scenarios, as Markdown.

@@ -148,15 +148,12 @@ impl DemandReader<'_> {
 
     /// Name for messages and contents of a trace.
     fn open(&self, path: &str, field: &Field<'_>) -> Result<(String, Vec<u8>), ScenarioError> {
-        if let Some(text) = crate::scenario::embedded::named_trace(path) {
+        if let Some(text) = crate::scenario::embedded::trace(path) {
             return Ok((format!("<embedded>/{path}"), text.as_bytes().to_vec()));
         }
         let file = match &self.base {
             TraceBase::Directory(directory) => directory.join(path),
-            TraceBase::Embedded => match crate::scenario::embedded::trace(path) {
-                Some(text) => return Ok((format!("<embedded>/{path}"), text.as_bytes().to_vec())),
-                None => PathBuf::from(path),
-            },
+            TraceBase::Embedded => PathBuf::from(path),
             TraceBase::Given(traces) => {
                 let given = traces.iter().find(|(name, _)| name == path);
                 let missing =
@@ -174,7 +171,7 @@ impl DemandReader<'_> {
                 }
                 if matches!(self.base, TraceBase::Embedded) {
                     expected += ": a file, or one of the embedded ";
-                    expected += &crate::scenario::embedded::trace_names().collect::<Vec<_>>().join(", ");
+                    expected += &crate::scenario::embedded::TRACE_NAMES.replace('`', "");
                 }
                 Err(field.bad_because(Some(problem), &expected))
             }

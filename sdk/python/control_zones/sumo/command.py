@@ -12,6 +12,7 @@ import typing
 
 from .. import world
 from .._session import Error
+from .periods import period
 
 if typing.TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,6 +54,12 @@ def command(given: Sequence[str]) -> int:
     imported.add_argument("--approach", type=float, default=150.0, metavar="M", help="so much of incoming lanes at most [150]")
     imported.add_argument("--rate", type=float, default=200.0, metavar="VPH", help="vehicles an hour and lane without --rou [200]")
     imported.add_argument("--out", required=True, metavar="FILE.toml")
+    arrivals = commands.add_parser("arrivals", help="an arrival trace of SUMO's human drivers")
+    arrivals.add_argument("--road", action="append", default=[], metavar="NAME", help="may be repeated [main1, merge1, merge2]")
+    arrivals.add_argument("--rate", action="append", default=[], type=period, metavar="[UNTIL_S:]VPH", help="vehicles an hour and road; periods in order may be repeated [2000:400]")
+    arrivals.add_argument("--seed", type=int, default=1, metavar="N", help="of SUMO [1]")
+    arrivals.add_argument("--vehicles", type=int, metavar="N", help="only so many [all]")
+    arrivals.add_argument("--out", required=True, metavar="FILE.csv")
     for one in (run, again):
         one.add_argument("--penetration", type=float, default=1.0, metavar="P", help="share of automated vehicles [1]")
         one.add_argument("--seed", type=int, metavar="N", help="of SUMO and of the scenario")
@@ -73,6 +80,12 @@ def command(given: Sequence[str]) -> int:
         from .importing import write
 
         write(args)
+        return 0
+    if args.command == "arrivals":
+        from .arrivals import write as write_arrivals
+
+        with tempfile.TemporaryDirectory(prefix=f"cz-sumo-{os.getpid()}-") as folder:
+            write_arrivals(args, folder)
         return 0
     if not 0.0 <= args.penetration <= 1.0:
         raise Error(f"--penetration is {args.penetration}, expected 0 to 1")
