@@ -101,6 +101,11 @@ impl From<CompareError> for AppError {
     }
 }
 
+/// `cz study`.
+fn study(args: &crate::compare::study::StudyArgs) -> Result<(), AppError> {
+    print(&crate::compare::study::main(args)?)
+}
+
 /// `cz compare`.
 fn compare(args: &crate::compare::cli::CompareArgs) -> Result<(), AppError> {
     print(&crate::compare::cli::main(args)?)
@@ -151,6 +156,7 @@ pub fn cz() -> ExitCode {
             args::Command::Branch(args) => resume::branch(&args),
             args::Command::Reproduce(args) => reproduce::cli::main(&args).map_err(AppError::from),
             args::Command::Compare(args) => compare(&args),
+            args::Command::Study(args) => study(&args),
             args::Command::Clean(args) => clean::clean(&args),
             args::Command::Bench(args) => bench::bench(&args),
             args::Command::Plugin { command } => plugin::plugin(&command),

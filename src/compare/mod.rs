@@ -5,12 +5,14 @@
 
 pub mod cache;
 pub mod cli;
+pub mod encounters;
 pub mod figure;
 pub mod measure;
 pub mod policy;
 mod processes;
 pub mod report;
 pub mod sample;
+pub mod study;
 pub mod tables;
 
 use crate::bounds::{Bounds, joint};

@@ -168,7 +168,7 @@ impl Sample {
 
 /// Looks at the states of every step for what the world does not account.
 #[derive(Default)]
-struct Observer {
+pub(super) struct Observer {
     seen: BTreeMap<u32, Seen>,
 }
 
@@ -182,7 +182,7 @@ struct Seen {
 }
 
 impl Observer {
-    fn see(&mut self, world: &World) {
+    pub(super) fn see(&mut self, world: &World) {
         let dt_s = world.scenario().dt_s();
         for record in world.records().filter(|r| r.flags & STATE_LEFT == 0) {
             let seen = self.seen.entry(record.vehicle).or_default();
@@ -196,7 +196,7 @@ impl Observer {
         }
     }
 
-    fn sample(mut self, world: &World, complete: bool) -> Sample {
+    pub(super) fn sample(mut self, world: &World, complete: bool) -> Sample {
         let scenario = world.scenario();
         let summary = world.summary();
         let mut visits: HashMap<u32, Vec<VisitSample>> = HashMap::new();

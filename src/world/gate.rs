@@ -7,6 +7,9 @@ use crate::vehicle::Held;
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, VecDeque};
 
+/// Room in a road's queue from the beginning.
+const QUEUE: usize = 16;
+
 /// All entry roads.
 #[derive(Debug)]
 pub(super) struct Gates {
@@ -53,7 +56,7 @@ impl Gates {
                 .collect(),
             pending: vec![None; roads.len()],
             next: BinaryHeap::with_capacity(roads.len()),
-            waiting: vec![VecDeque::new(); roads.len()],
+            waiting: roads.iter().map(|_| VecDeque::with_capacity(QUEUE)).collect(),
             queues: Vec::new(),
             left_to_generate: scenario.max_vehicles.unwrap_or(u32::MAX),
             held: 0,

@@ -8,6 +8,7 @@ mod run;
 mod scenario;
 
 use crate::compare::cli::CompareArgs;
+use crate::compare::study::StudyArgs;
 use crate::reproduce::cli::ReproduceArgs;
 pub(super) use bench::{BenchArgs, BenchKind, MeasureArgs, PeerArgs, ViewBenchArgs, WaitBenchArgs};
 use clap::{Args, Parser, Subcommand};
@@ -64,6 +65,8 @@ pub(super) enum Command {
     Reproduce(ReproduceArgs),
     /// Compare policies on the same arrivals: costs, safety, comfort, and how far they are from what is possible.
     Compare(CompareArgs),
+    /// Study mixed traffic: the same demand at every share of automated vehicles among human drivers.
+    Study(StudyArgs),
     /// Measure latency, the solver, scale, or waiting on this machine.
     Bench(BenchArgs),
     /// Remove the shared memory and files that crashed runs of yours have left; active runs are not touched.
