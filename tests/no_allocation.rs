@@ -70,19 +70,17 @@ fn steady_steps_in_one_process_allocate_nothing() {
     in_one_process(&scenario());
 }
 
-/// Among humans who follow the order, and others, who make events of their own.
+/// Among humans.
 #[test]
 fn steady_steps_among_humans_allocate_nothing() {
-    for yields in ["order", "priority"] {
-        let human = format!("{{name=\"human\",driver=\"human\",yields=\"{yields}\",noise_mps2=0.3}}");
-        let sets = [
-            "end.vehicles=400".to_owned(),
-            format!("fleet=[{{name=\"automated\"}},{human}]"),
-            "roads.*.automated=0.5".to_owned(),
-        ];
-        let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
-        in_one_process(&Arc::new(load(Some("varying-demand"), &sets, Some(1)).unwrap()));
-    }
+    let human = "{name=\"human\",driver=\"human\",noise_mps2=0.3}";
+    let sets = [
+        "end.vehicles=400".to_owned(),
+        format!("fleet=[{{name=\"automated\"}},{human}]"),
+        "roads.*.automated=0.5".to_owned(),
+    ];
+    let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
+    in_one_process(&Arc::new(load(Some("varying-demand"), &sets, Some(1)).unwrap()));
 }
 
 fn in_one_process(scenario: &Arc<Scenario>) {

@@ -147,6 +147,13 @@ impl Ledger {
     /// written over. `stands_in` when it is one of ours in the place of one written elsewhere.
     pub fn command(&mut self, controller: usize, commands: &mut Vec<VehicleCommand>, stands_in: bool) {
         std::mem::swap(&mut self.now[controller], commands);
+        // The three that take turns grow together, in the step that brings more vehicles than any before.
+        let room = self.now[controller].capacity();
+        for other in [commands, &mut self.before[controller]] {
+            if other.capacity() < room {
+                other.reserve_exact(room - other.len());
+            }
+        }
         self.foreign_now |= u64::from(controller >= self.pool && !stands_in) << controller;
     }
 
