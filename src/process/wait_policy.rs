@@ -405,7 +405,7 @@ mod tests {
         }
         assert!(holds[0] < 2 * LEAST_HOLD && holds.windows(2).all(|h| h[1] + 3 * MS > h[0]), "{holds:?}");
         assert!((GREATEST_HOLD..GREATEST_HOLD + 10 * MS).contains(&holds[7]), "{holds:?}");
-        // While more want to run than there are cores, it is not tried at all.
+        // While no core has idle time, it is not tried at all.
         scene.is_busy = true;
         let until = scene.now + 10 * GREATEST_HOLD;
         while scene.now < until {
