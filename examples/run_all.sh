@@ -12,7 +12,8 @@ trap 'rm -rf "$work"' EXIT
 cargo build $flag --bins
 cargo build $flag -p control-zones-c
 cargo build $flag -p control-zones-plugin --example mpc
-cargo build $flag --example world -p control-zones-env
+cargo build $flag --example world
+cargo build $flag -p control-zones-env
 cz=target/$profile/cz
 
 python=${CZ_PYTHON:-}

@@ -17,6 +17,13 @@ pub struct Points {
     speeds_mps: BTreeMap<u32, f64>,
 }
 
+impl Points {
+    /// How fast a vehicle is, m/s; 0 when it is not there.
+    pub fn v_mps(&self, vehicle: u32) -> f64 {
+        self.speeds_mps.get(&vehicle).copied().unwrap_or(0.0)
+    }
+}
+
 impl Traffic for Points {
     fn name(&self) -> String {
         "points".to_owned()

@@ -47,6 +47,8 @@ pub(super) fn sumo(arguments: &[OsString]) -> Result<(), AppError> {
             command
         }
     };
+    // It may have runs to start itself.
+    command.envs(std::env::current_exe().ok().map(|own| ("CZ_PROGRAM", own)));
     let error = command.args(arguments).exec();
     Err(AppError::Usage(format!("cannot start a Python for cz sumo: {error}")))
 }

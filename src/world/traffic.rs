@@ -360,9 +360,12 @@ impl World {
                     continue;
                 };
                 let mean_mps2 = (done.v_mps - car.v_mps) / dt_s;
-                let there_m = 0.5 * (car.v_mps + done.v_mps) * dt_s;
-                deviation_m = deviation_m.max((done.advanced_m - there_m).abs());
                 let stops = done.v_mps == 0.0 && car.v_mps + car.command_mps2 * dt_s <= 0.0;
+                let there_m = match stops && car.is_commanded && car.command_mps2 < 0.0 {
+                    true => car.v_mps * car.v_mps / (-2.0 * car.command_mps2),
+                    false => 0.5 * (car.v_mps + done.v_mps) * dt_s,
+                };
+                deviation_m = deviation_m.max((done.advanced_m - there_m).abs());
                 if car.is_commanded && !stops {
                     disobedience_mps2 = disobedience_mps2.max((mean_mps2 - car.command_mps2).abs());
                 }

@@ -57,9 +57,18 @@ impl Traffic for Broken {
             "fails" if step == BREAKS_AT => return Err(TrafficError("the road is closed".to_owned())),
             _ => {}
         }
+        let before: Vec<f64> = tasks.iter().map(|task| self.points.v_mps(task.vehicle)).collect();
         let coming = self.points.step(step, &tasks, done, newcomers)?;
         let held = tasks.iter().position(|task| task.is_held == 1);
         match (mode, held) {
+            // To a standstill over the whole step, not as hard as told.
+            ("stops-late", _) => {
+                done.iter_mut().zip(&before).filter(|(done, _)| done.v_mps == 0.0).for_each(
+                    |(done, v_mps)| {
+                        done.advanced_m = 0.5 * v_mps * dt_s;
+                    },
+                );
+            }
             // v += u dt, then x += v dt.
             ("euler", _) => done.iter_mut().for_each(|done| done.advanced_m = done.v_mps * dt_s),
             ("creeps", _) => done.iter_mut().for_each(|done| done.v_mps = done.v_mps.max(0.2)),

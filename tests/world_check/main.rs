@@ -45,9 +45,10 @@ fn a_good_world_passes() {
 }
 
 /// Mode, rules it breaks, the step of the first breach (a vehicle may come later than the fault sets in), and words of the diagnosis.
-const BROKEN: [(&str, &[&str], Option<u64>, &str); 15] = [
+const BROKEN: [(&str, &[&str], Option<u64>, &str); 16] = [
     ("disobeys", &["obedience"], None, "m/s^2, and held"),
     ("euler", &["motion"], None, "expected"),
+    ("stops-late", &["motion"], None, "to 0.000 m/s, expected"),
     ("jumps", &["motion"], Some(151), "vehicle 0 came"),
     ("loses", &["kept"], Some(151), "was taken out of"),
     ("creeps", &["standing"], None, "to hold -4.000 m/s^2"),

@@ -153,9 +153,9 @@ pub(in crate::app) struct WorldCheckArgs {
     #[arg(long, value_name = "MPS2", default_value_t = 0.01)]
     pub tolerance: f64,
     /// How far a way may be from the one that goes with the speeds at its ends, m.
-    #[arg(long, value_name = "M", default_value_t = 0.005)]
+    #[arg(long, value_name = "M", default_value_t = 0.001)]
     pub way_tolerance: f64,
-    /// How long it may take to open the run, to make a step, and to end, s.
+    /// How long it may take to make a step and to end, s; to open the run, at least 30.
     #[arg(long, value_name = "SECONDS", default_value_t = 30.0)]
     pub patience: f64,
     /// Breaches of this rule are told of, and do not count, e.g. `--allow kept` where vehicles change lanes out of a

@@ -183,11 +183,16 @@ impl Judge {
         let (vehicle, way) = (now.vehicle, now.x_m - before.x_m);
         let commanded = self.commanded.get(&vehicle).copied();
         let stops = now.v_mps == 0.0;
-        let expected_m = 0.5 * (before.v_mps + now.v_mps) * dt_s;
-        // Where it stops within the step, it stands for the rest.
-        let off_m = match stops {
-            true => (way - before.v_mps * dt_s).max(-way).max(0.0),
-            false => (way - expected_m).abs(),
+        // Who is commanded to a standstill stands for the rest of the step.
+        let expected_m = match commanded {
+            Some(u_mps2) if before.v_mps + u_mps2 * dt_s < 0.0 => {
+                before.v_mps * before.v_mps / (-2.0 * u_mps2)
+            }
+            _ => 0.5 * (before.v_mps + now.v_mps) * dt_s,
+        };
+        let off_m = match (stops, commanded) {
+            (true, None) => (way - before.v_mps * dt_s).max(-way).max(0.0),
+            _ => (way - expected_m).abs(),
         };
         self.greatest_deviation_m = self.greatest_deviation_m.max(off_m);
         if off_m > way_m {

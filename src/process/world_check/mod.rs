@@ -37,6 +37,8 @@ pub const CHANGES: [&str; 3] = ["shield=off", "gate.entry=viable", "end.time_s=8
 /// How long the controller keeps the world waiting, and how long that is stopped.
 const LATE: Duration = Duration::from_millis(1000);
 const STOPPED: Duration = Duration::from_millis(500);
+/// How long it may take to open the run, at least: some are slow to start.
+const JOIN: Duration = Duration::from_secs(30);
 /// How long the world of the third run waits for an answer, and how much longer it may take.
 const PEER_TIMEOUT: Duration = Duration::from_secs(1);
 const LEAVING: Duration = Duration::from_secs(10);
@@ -50,7 +52,7 @@ pub struct WorldCheckOptions {
     pub scenario: Vec<String>,
     /// How far what happens may be from what was asked for.
     pub tolerances: Tolerances,
-    /// How long it may take to open the run, to state a step, and to end.
+    /// How long it may take to state a step and to end, and, where it is more than 30 s, to open the run.
     pub patience: Duration,
 }
 

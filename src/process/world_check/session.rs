@@ -2,7 +2,7 @@
 
 use super::foreign::Foreign;
 use super::judge::Judge;
-use super::{Kit, PEER_TIMEOUT, Play, WorldRule};
+use super::{JOIN, Kit, PEER_TIMEOUT, Play, WorldRule};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::own_time::Bound;
@@ -68,7 +68,9 @@ impl Session {
         let space = RunSpace::enter(&run)?;
         let peer_timeout = if play == Play::Abandoned { PEER_TIMEOUT } else { options.patience };
         let mut arguments: Vec<String> = ["world", "--run", &run.to_string()].map(str::to_owned).into();
-        for (flag, duration) in [("--attach-timeout", options.patience), ("--peer-timeout", peer_timeout)] {
+        for (flag, duration) in
+            [("--attach-timeout", JOIN.max(options.patience)), ("--peer-timeout", peer_timeout)]
+        {
             arguments.extend([flag.to_owned(), duration.as_secs_f64().to_string()]);
         }
         arguments.extend(["--json".to_owned(), summary.display().to_string()]);
@@ -276,6 +278,6 @@ fn join(
     world: &Foreign,
 ) -> Result<Attachment, ProcessError> {
     let scenario_hash = Some(scenario_hash(kit.scenario));
-    let joining = Joining { role, index: Some(0), scenario_hash, timeout: kit.options.patience };
+    let joining = Joining { role, index: Some(0), scenario_hash, timeout: JOIN.max(kit.options.patience) };
     Attachment::join(space, run, joining, &world.has_ended)
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -38,7 +39,7 @@ def command(given: Sequence[str]) -> int:
     commands = parser.add_subparsers(dest="command", required=True)
     run = commands.add_parser("run", help="junctions of a SUMO configuration as control zones")
     run.add_argument("config", metavar="CONFIG.sumocfg")
-    run.add_argument("--zone", action="append", default=[], metavar="JUNCTION", help="may be repeated; default: all with conflicts")
+    run.add_argument("--zone", action="append", default=[], metavar="JUNCTION[+JUNCTION…]", help="one, or several as one zone; may be repeated; default: all with conflicts, roundabouts as one")
     run.add_argument("--approach", type=float, default=150.0, metavar="M", help="so much of incoming lanes at most [150]")
     run.add_argument("--cav", action="append", default=[], metavar="TYPE", help="vehicle types that are automated [all]")
     run.add_argument("--scenario-out", metavar="FILE", help="keep the scenario that was made of the junctions")
@@ -50,7 +51,7 @@ def command(given: Sequence[str]) -> int:
     imported = commands.add_parser("import", help="a SUMO network as a scenario for our own world")
     imported.add_argument("net", metavar="NET.xml")
     imported.add_argument("--rou", action="append", default=[], metavar="ROU.xml", help="vehicles and flows; their rates by road are kept")
-    imported.add_argument("--zone", action="append", default=[], metavar="JUNCTION", help="may be repeated; default: all with conflicts")
+    imported.add_argument("--zone", action="append", default=[], metavar="JUNCTION[+JUNCTION…]", help="one, or several as one zone; may be repeated; default: all with conflicts, roundabouts as one")
     imported.add_argument("--approach", type=float, default=150.0, metavar="M", help="so much of incoming lanes at most [150]")
     imported.add_argument("--rate", type=float, default=200.0, metavar="VPH", help="vehicles an hour and lane without --rou [200]")
     imported.add_argument("--out", required=True, metavar="FILE.toml")
@@ -60,6 +61,16 @@ def command(given: Sequence[str]) -> int:
     arrivals.add_argument("--seed", type=int, default=1, metavar="N", help="of SUMO [1]")
     arrivals.add_argument("--vehicles", type=int, metavar="N", help="only so many [all]")
     arrivals.add_argument("--out", required=True, metavar="FILE.csv")
+    costs = commands.add_parser("cost", help="whose the time of a step is: grids of all sizes, in one process and in several")
+    costs.add_argument("--vehicles", type=counts, default=[30, 300, 3000], metavar="N,N,…", help="at once [30,300,3000]")
+    costs.add_argument("--seed", type=int, default=1, metavar="N", help="of the vehicles' ways, and of SUMO [1]")
+    costs.add_argument("--cz", metavar="PROGRAM", default=os.environ.get("CZ_PROGRAM") or shutil.which("cz"), help="starts the several processes [the one this is started by, or cz on the path]")
+    beside = commands.add_parser("compare", help="scenarios of ours in our world and in SUMO's, over several seeds")
+    beside.add_argument("scenario", nargs="*", help="as for `cz run` [two-merges intersection roundabout]")
+    beside.add_argument("--seeds", type=int, default=5, metavar="N", help="1 to N [5]")
+    beside.add_argument("--rules", type=words, default=["priority", "zipper", "traffic_light"], metavar="TYPE,…", help="of junctions where SUMO's drivers decide")
+    beside.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as for `cz run`")
+    beside.add_argument("--cz", metavar="PROGRAM", default=os.environ.get("CZ_PROGRAM") or shutil.which("cz"), help="runs our own world [the one this is started by, or cz on the path]")
     for one in (run, again):
         one.add_argument("--penetration", type=float, default=1.0, metavar="P", help="share of automated vehicles [1]")
         one.add_argument("--seed", type=int, metavar="N", help="of SUMO and of the scenario")
@@ -87,11 +98,34 @@ def command(given: Sequence[str]) -> int:
         with tempfile.TemporaryDirectory(prefix=f"cz-sumo-{os.getpid()}-") as folder:
             write_arrivals(args, folder)
         return 0
+    if args.command == "cost":
+        from .cost import main as cost
+
+        cost(args)
+        return 0
+    if args.command == "compare":
+        from .compare import main as compare
+
+        compare(args)
+        return 0
     if not 0.0 <= args.penetration <= 1.0:
         raise Error(f"--penetration is {args.penetration}, expected 0 to 1")
     with tempfile.TemporaryDirectory(prefix=f"cz-sumo-{os.getpid()}-") as folder:
         traffic, simulation, run_arguments = replica(args, folder) if args.command == "scenario" else junctions(args, folder)
         return conduct(args, traffic, simulation, behind or run_arguments, folder)
+
+
+def counts(text: str) -> list[int]:
+    """Numbers of vehicles, as an argument has them."""
+    found = [int(one) for one in text.split(",")]
+    if not all(1 <= one <= 20_000 for one in found):
+        raise ValueError(text)
+    return found
+
+
+def words(text: str) -> list[str]:
+    """Words between commas."""
+    return [word for word in text.split(",") if word]
 
 
 def replica(args: argparse.Namespace, folder: str) -> tuple[world.Traffic, Simulation, list[str]]:

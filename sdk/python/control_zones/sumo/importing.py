@@ -7,12 +7,13 @@ import typing
 import xml.etree.ElementTree as ElementTree
 
 from .._session import Error
-from .network import connect, incoming, word, zone_of
+from .network import Zone, connect, incoming, is_narrow, word, zone_of
 from .scenario import Kind, text
 from .simulation import read_net
 
 if typing.TYPE_CHECKING:
     import argparse
+    from collections.abc import Sequence
 
 #: SUMO's default passenger car.
 CAR = Kind("passenger", 5.0, -4.5, 2.6)
@@ -27,8 +28,7 @@ def write(args: argparse.Namespace) -> None:
     net = read_net(args.net)
     ids = args.zone or with_conflicts(net)
     zones = [zone_of(net, junction, args.approach) for junction in ids]
-    limits = [float(net.getLane(path.lanes[0][0]).getSpeed()) for zone in zones for path in zone.paths]
-    v_max_mps = min(limits)
+    v_max_mps = limit(net, zones)
     connect(net, list(zip(ids, zones)), v_max_mps * DT_S)
     roads = [segment for zone in zones for segment in zone.segments if segment.road]
     if not roads:
@@ -52,10 +52,22 @@ def write(args: argparse.Namespace) -> None:
         raise Error(f"--out {args.out}: {error}") from error
 
 
+def limit(net: typing.Any, zones: Sequence[Zone]) -> float:
+    """The least limit of roads to and within zones, m/s."""
+    to_them = [float(net.getLane(path.lanes[0][0]).getSpeed()) for zone in zones for path in zone.paths]
+    return min([*to_them, *(zone.v_max_mps for zone in zones)])
+
+
 def with_conflicts(net: typing.Any) -> list[str]:
-    """Junctions at which ways meet, in order of their names."""
-    found = []
+    """Junctions at which ways meet, in order of their names; those of what SUMO knows as a roundabout together, where it
+    is narrow."""
+    all_rings = [sorted(str(node) for node in ring.getNodes()) for ring in net.getRoundabouts()]
+    rings = ["+".join(nodes) for nodes in all_rings if is_narrow(net, nodes)]
+    found = list(rings)
+    in_rings = {node for ring in rings for node in ring.split("+")}
     for node in net.getNodes():
+        if node.getID() in in_rings:
+            continue
         if len(incoming(net, str(node.getID()))) > 1 and node.getType() not in ("dead_end", "rail_signal"):
             found.append(str(node.getID()))
     if not found:

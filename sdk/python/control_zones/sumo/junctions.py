@@ -11,10 +11,10 @@ import libsumo
 
 from .._session import Error
 from ..world import GONE, Newcomer, Traffic
-from .importing import with_conflicts
+from .importing import limit, with_conflicts
 from .network import Zone, too_short, word, zone_of
 from .scenario import Kind, text
-from .simulation import Simulation, is_automated, read_net
+from .simulation import Car, Simulation, is_automated, read_net
 
 if typing.TYPE_CHECKING:
     import argparse
@@ -25,17 +25,9 @@ class Place(typing.NamedTuple):
     """A lane of a zone: where it is on which of its paths."""
 
     zone: int
-    #: Paths over the lane, each with the distance of the lane's beginning from the zone's origin, m.
-    paths: tuple[tuple[int, float], ...]
-
-
-class Member:
-    """A vehicle in a zone."""
-
-    __slots__ = ("lane", "name", "number", "path", "x_m", "zone")
-
-    def __init__(self, name: str, number: int, zone: int, path: int, x_m: float) -> None:
-        self.name, self.number, self.zone, self.path, self.x_m = name, number, zone, path, x_m
+    #: Paths over the lane, each with the distance of the lane's beginning from the zone's origin, m, and the roads that
+    #: follow on it.
+    paths: tuple[tuple[int, float, tuple[str, ...]], ...]
 
 
 class JunctionTraffic(Traffic):
@@ -50,124 +42,125 @@ class JunctionTraffic(Traffic):
         self.zones, self.kinds, self.simulation, self.automated = zones, kinds, simulation, automated
         self.lanes: dict[str, Place] = {}
         for index, zone in enumerate(zones):
-            over: dict[str, list[tuple[int, float]]] = {}
+            over: dict[str, list[tuple[int, float, tuple[str, ...]]]] = {}
             for number, path in enumerate(zone.paths):
-                for lane, at_m in path.lanes[:-1]:
-                    over.setdefault(lane, []).append((number, at_m))
+                for at, (lane, at_m) in enumerate(path.lanes[:-1]):
+                    onward = tuple(name.rsplit("_", 1)[0] for name, _ in path.lanes[at + 1 :] if not name.startswith(":"))
+                    over.setdefault(lane, []).append((number, at_m, onward))
             self.lanes.update({lane: Place(index, tuple(paths)) for lane, paths in over.items()})
-        #: By name, those in zones; by number, the names of all who are still asked about.
-        self.members: dict[str, Member] = {}
-        self.names: dict[int, str] = {}
+        self.rank = {lane: rank for rank, lane in enumerate(self.lanes)}
+        #: By number, those who are asked about; in those of `left`, who are in that zone no more.
+        self.cars: dict[int, Car] = {}
+        self.left: set[int] = set()
+        #: By name, those who are in the network and in no zone.
+        self.outside: dict[str, Car] = {}
         self.count = 0
         self.is_automated: dict[str, bool] = {}
 
     def step(self, step: int, tasks: Sequence[tuple[float, int, int]]) -> tuple[Iterable[float], Sequence[Newcomer], bool]:
         """One step of SUMO."""
-        simulation, names, members = self.simulation, self.names, self.members
+        simulation, cars, outside = self.simulation, self.cars, self.outside
+        hold, moves = simulation.hold, simulation.moves
         for u_mps2, number, is_held in tasks:
-            name = names.get(number)
-            if name is None:
+            car = cars.get(number)
+            if car is None:
                 continue
-            member = members.get(name)
             if is_held:
-                simulation.hold(name, u_mps2)
-            elif member is None or member.number == number:
-                simulation.release(name)
+                hold(car, u_mps2)
+            elif car.number in (number, -1):
+                simulation.release(car)
         simulation.step()
-        moved = {name: simulation.moved(name) for name in {names[number] for _, number, _ in tasks if number in names}}
-        asked = {number for _, number, _ in tasks}
-        here = self.look()
+        for name in simulation.gone:
+            outside.pop(name, None)
+        for name in simulation.came:
+            outside[name] = Car(name)
+        if self.left:
+            asked = {number for _, number, _ in tasks}
+            for number in [number for number in self.left if number not in asked]:
+                self.left.discard(number)
+                cars.pop(number, None)
         did: list[float] = []
-        for _, number, _ in tasks:
-            name = names.get(number)
-            came = moved[name] if name is not None else None
-            member = members.get(name) if name is not None else None
-            if name is None or came is None:
+        for _, number, is_held in tasks:
+            car = cars.get(number)
+            if car is None or not moves(car):
                 did.extend(GONE)
-                names.pop(number, None)
-                if member is not None and member.number == number:
-                    del members[member.name]
+                if car is not None:
+                    car.number = -1
+                    del cars[number]
                 continue
-            if member is not None and member.number == number:
-                member.x_m += came[0]
-                zone = self.zones[member.zone]
-                if member.x_m >= zone.paths[member.path].length_m:
-                    del members[name]  # It has left the zone, and is followed as long as it matters there.
-                elif name not in here or not self.is_where(member, here[name]):
-                    del members[name]
-                    names.pop(number)
+            if car.number == number:
+                car.x_m += car.advanced_m
+                if car.x_m >= car.length_m:
+                    self.leave(car)  # It is followed as long as it matters there.
+                elif not is_held and not self.is_where(car):
+                    # One that is held changes no lanes.
+                    self.leave(car)
+                    del cars[number]
                     did.extend(GONE)
                     continue
-            did.extend(came)
-        for number in [number for number, name in names.items() if number not in asked and not self.is_member(number, name)]:
-            del names[number]
-        newcomers = self.newcomers(here)
-        return did, newcomers, libsumo.simulation.getMinExpectedNumber() > 0
+            did += (car.advanced_m, car.v_mps)
+        return did, self.newcomers(), libsumo.simulation.getMinExpectedNumber() > 0
 
-    def is_member(self, number: int, name: str) -> bool:
-        """Whether a number is that of one in a zone now."""
-        member = self.members.get(name)
-        return member is not None and member.number == number
+    def leave(self, car: Car) -> None:
+        """Counts one among those outside."""
+        self.left.add(car.number)
+        car.number = -1
+        self.outside[car.name] = car
 
-    def look(self) -> dict[str, str]:
-        """Who is on the zones' lanes."""
-        found: dict[str, str] = {}
-        vehicles_on = libsumo.lane.getLastStepVehicleIDs
-        for lane in self.lanes:
-            for name in vehicles_on(lane):
-                found[name] = lane
-        return found
-
-    def is_where(self, member: Member, lane: str) -> bool:
+    def is_where(self, car: Car) -> bool:
         """Whether one is on a lane of its path still."""
-        place = self.lanes[lane]
-        return place.zone == member.zone and any(path == member.path for path, _ in place.paths)
+        place = self.lanes.get(libsumo.vehicle.getLaneID(car.name))
+        return place is not None and place.zone == car.zone and any(path == car.path for path, *_ in place.paths)
 
-    def newcomers(self, here: dict[str, str]) -> list[Newcomer]:
-        """Those on a zone's lanes who were not in it."""
+    def newcomers(self) -> list[Newcomer]:
+        """Those outside who are on a zone's lanes now: lane by lane, and from the back on each."""
         found = []
-        for name, lane in here.items():
-            if name in self.members:
+        lane_of, position_of = libsumo.vehicle.getLaneID, libsumo.vehicle.getLanePosition
+        for name, car in self.outside.items():
+            lane = lane_of(name)
+            place = self.lanes.get(lane)
+            if place is None:
                 continue
-            place = self.lanes[lane]
-            chosen = self.choose(name, lane, place)
-            if chosen is None:
-                continue
-            (path, begins_m), is_right = chosen
-            x_m = begins_m + libsumo.vehicle.getLanePosition(name)
-            zone = self.zones[place.zone]
-            if not 0.0 <= x_m < zone.paths[path].length_m:
-                continue
-            kind = libsumo.vehicle.getTypeID(name)
-            if name not in self.is_automated:
-                self.is_automated[name] = self.automated(name, kind)
-            is_commanded = is_right and self.is_automated[name]
-            self.simulation.see(name)
-            if not is_commanded:
-                self.simulation.release(name)
-            self.members[name] = Member(name, self.count, place.zone, path, x_m)
-            self.names[self.count] = name
-            self.count += 1
-            v_mps = self.simulation.last[name][1]
-            found.append(Newcomer(x_m, v_mps, place.zone, path, kind=self.kind(kind), is_commanded=int(is_commanded)))
-        return found
+            at_m = position_of(name)
+            # All ways over a lane begin it at the same place, or it is one within the junction.
+            if place.paths[0][1] + at_m >= 0.0:
+                found.append((self.rank[lane], at_m, lane, car))
+        found.sort(key=lambda one: one[:2])
+        return [newcomer for _, at_m, lane, car in found if (newcomer := self.let_in(car, lane, at_m)) is not None]
+
+    def let_in(self, car: Car, lane: str, at_m: float) -> Newcomer | None:
+        """Makes one a member of the zone whose lane it is on, unless it has as good as left that."""
+        name, place = car.name, self.lanes[lane]
+        path, begins_m, is_right = self.choose(name, place)
+        x_m, length_m = begins_m + at_m, self.zones[place.zone].paths[path].length_m
+        if not 0.0 <= x_m < length_m:
+            return None
+        kind = libsumo.vehicle.getTypeID(name)
+        if name not in self.is_automated:
+            self.is_automated[name] = self.automated(name, kind)
+        is_commanded = is_right and self.is_automated[name]
+        self.simulation.see(car)
+        if not is_commanded:
+            self.simulation.release(car)
+        car.number, car.zone, car.path, car.length_m, car.x_m = self.count, place.zone, path, length_m, x_m
+        self.cars[self.count] = car
+        del self.outside[name]
+        self.count += 1
+        return Newcomer(x_m, car.v_mps, place.zone, path, kind=self.kind(kind), is_commanded=int(is_commanded))
 
     def kind(self, name: str) -> int:
         """The index of a vehicle type; types that come later are as the first."""
         return self.kinds.get(name.split("@")[0], 0)
 
-    def choose(self, name: str, lane: str, place: Place) -> tuple[tuple[int, float], bool] | None:
-        """The path a vehicle takes from a lane, and whether it leads where its route does."""
-        if len(place.paths) == 1 and lane.startswith(":"):
-            return place.paths[0], True
-        route, at = libsumo.vehicle.getRoute(name), libsumo.vehicle.getRouteIndex(name)
-        onward = route[at + 1] if at + 1 < len(route) else None
-        paths = self.zones[place.zone].paths
-        for path, begins_m in place.paths:
-            if onward is not None and paths[path].lanes[-1][0].rsplit("_", 1)[0] == onward:
-                return (path, begins_m), True
+    def choose(self, name: str, place: Place) -> tuple[int, float, bool]:
+        """The path a vehicle takes from a lane, where that begins on it, and whether it leads where its route does."""
+        ahead = libsumo.vehicle.getRoute(name)[libsumo.vehicle.getRouteIndex(name) + 1 :]
+        for path, begins_m, onward in place.paths:
+            if ahead[: len(onward)] == onward:
+                return path, begins_m, True
         # It is to change lanes first, or its way ends here.
-        return place.paths[0], False
+        path, begins_m, _ = place.paths[0]
+        return path, begins_m, False
 
 
 def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation, list[str]]:
@@ -184,9 +177,6 @@ def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation,
     simulation = Simulation(["-c", args.config, *args.sumo], args.step_length, seed)
     ids = suitable(net, args.zone)
     zones = [zone_of(net, junction, args.approach) for junction in ids]
-    limits = [
-        float(net.getLane(path.lanes[0][0]).getSpeed()) for zone in zones for path in zone.paths
-    ]
     kinds, index = fleet()
     unknown = [name for name in args.cav if name not in index]
     if unknown:
@@ -202,7 +192,7 @@ def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation,
         seed=seed,
         dt_s=args.step_length,
         end_s=end_s,
-        v_max_mps=min(limits),
+        v_max_mps=limit(net, zones),
         about=f"Junctions of {os.path.basename(args.config)}, made by `cz sumo run`: SUMO brings the vehicles, whatever the roads say.",
     )
     path = args.scenario_out or os.path.join(folder, "sumo.toml")
@@ -221,7 +211,7 @@ def suitable(net: typing.Any, named: list[str]) -> list[str]:
 
     Raises `Error` when one that is named cannot, or none can.
     """
-    reasons = {junction: too_short(net, junction) for junction in named or with_conflicts(net) if net.hasNode(junction)}
+    reasons = {junction: too_short(net, junction) for junction in named or with_conflicts(net)}
     bad = [reason for reason in reasons.values() if reason]
     if bad and (named or len(bad) == len(reasons)):
         raise Error(f"--zone: {bad[0]}: vehicles could not stop between junctions")

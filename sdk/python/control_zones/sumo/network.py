@@ -57,27 +57,53 @@ class Crossing:
 
 @dataclass
 class Zone:
-    """A junction as a control zone."""
+    """A junction, or several near each other, as a control zone."""
 
     name: str
     segments: list[Segment] = field(default_factory=list)
     paths: list[Path] = field(default_factory=list)
     crossings: list[Crossing] = field(default_factory=list)
+    #: The least limit of the roads between its junctions, m/s.
+    v_max_mps: float = math.inf
+
+
+@dataclass
+class Stretch:
+    """What is within a zone: lanes one after the other, from one lane to another."""
+
+    name: str
+    start: str
+    end: str
+    length_m: float
+    shape: list[Place]
+    #: With the distance from its beginning at which each begins.
+    lanes: list[tuple[str, float]]
+
+
+def members(net: typing.Any, junction: str) -> list[str]:
+    """The junctions of a zone: one, or several with plus signs between.
+
+    Raises `Error` when one is not there.
+    """
+    names = [junction] if net.hasNode(junction) else junction.split("+")
+    for name in names:
+        if not net.hasNode(name):
+            known = ", ".join(sorted(node.getID() for node in net.getNodes())[:20])
+            raise Error(f"--zone: there is no junction {name} in the network, expected one of {known}, or several: A+B")
+    return names
 
 
 def zone_of(net: typing.Any, junction: str, approach_m: float) -> Zone:
-    """The zone of a junction, with so much of its incoming lanes at most.
+    """The zone of a junction, or of several as one, with so much of its incoming lanes at most.
 
     Raises `Error` when there is no such junction, or nothing for vehicles to drive on in it.
     """
-    if not net.hasNode(junction):
-        known = ", ".join(sorted(node.getID() for node in net.getNodes())[:20])
-        raise Error(f"--zone: there is no junction {junction} in the network, expected one of {known}")
+    nodes = set(members(net, junction))
     zone = Zone(word(junction))
-    inner: dict[str, list[Place]] = {}
+    inner: dict[str, Stretch] = {}
     for edge in incoming(net, junction):
         for lane in edge.getLanes():
-            add_lane(net, zone, lane, approach_m, inner)
+            add_lane(net, zone, lane, approach_m, nodes, inner)
     if not zone.paths:
         raise Error(f"--zone: vehicles cannot cross junction {junction}: no connection of it is for passenger cars")
     zone.crossings = crossings(zone, inner)
@@ -85,77 +111,123 @@ def zone_of(net: typing.Any, junction: str, approach_m: float) -> Zone:
 
 
 def incoming(net: typing.Any, junction: str) -> list[typing.Any]:
-    """The roads that lead to a junction, in order of their names."""
-    edges = (edge for edge in net.getNode(junction).getIncoming() if edge.getFunction() == "")
-    return sorted(edges, key=lambda edge: str(edge.getID()))
+    """The roads that lead to the junctions of a zone from elsewhere, in order of their names."""
+    nodes = members(net, junction)
+    edges = (edge for node in nodes for edge in net.getNode(node).getIncoming() if edge.getFunction() == "")
+    return sorted((edge for edge in edges if edge.getFromNode().getID() not in nodes), key=lambda edge: str(edge.getID()))
 
 
-def too_short(net: typing.Any, junction: str) -> str | None:
-    """What is wrong with a junction as a zone: a road on which vehicles cannot stop, and keep their distance, from one
-    junction to the next; `None` when nothing is."""
+def too_short(net: typing.Any, junction: str, room_m: float = ROOM_M) -> str | None:
+    """What is wrong with a zone: a road on which vehicles cannot stop, and keep their distance, from one
+    junction to the next; `None` when nothing is. `room_m` is kept beside the way that stopping takes."""
     for edge in incoming(net, junction):
         for lane in edge.getLanes():
             v_mps = float(lane.getSpeed())
-            needed_m = v_mps * v_mps / (2.0 * BRAKING_MPS2) + REACTION_S * v_mps + ROOM_M
+            needed_m = v_mps * v_mps / (2.0 * BRAKING_MPS2) + REACTION_S * v_mps + room_m
             if lane.allows("passenger") and lane.getOutgoing() and float(lane.getLength()) < needed_m:
                 return f"lane {lane.getID()} to junction {junction} is {lane.getLength():.1f} m long, expected {needed_m:.1f} at {v_mps:.1f} m/s"
     return None
 
 
-def add_lane(net: typing.Any, zone: Zone, lane: typing.Any, approach_m: float, inner: dict[str, list[Place]]) -> None:
-    """Adds an incoming lane, and the ways over the junction that begin on it."""
+def is_narrow(net: typing.Any, ring: Sequence[str]) -> bool:
+    """Whether the junctions of a roundabout are too near to each other to be zones by themselves: between two of them vehicles
+    stop behind two others."""
+    return any(too_short(net, node, 3.0 * ROOM_M) for node in ring)
+
+
+def onward(net: typing.Any, lane: typing.Any) -> list[tuple[Stretch, typing.Any]]:
+    """The ways over a junction that begin on a lane, each with the lane it leads to."""
+    found: list[tuple[Stretch, typing.Any]] = []
+    for connection in lane.getOutgoing():
+        to, via = connection.getToLane(), connection.getViaLaneID()
+        if not (lane.allows("passenger") and to.allows("passenger")) or any(to is known for _, known in found):
+            continue
+        start, end = word(lane.getID()), word(to.getID())
+        stretch = Stretch(f"{start[:30]}-{end[:30]}", start, end, 0.0, [], [])
+        while via:
+            inside = net.getLane(via)
+            stretch.lanes.append((via, stretch.length_m))
+            stretch.length_m += float(inside.getLength())
+            stretch.shape += [place for place in inside.getShape() if not stretch.shape or place != stretch.shape[-1]]
+            via = inside.getOutgoing()[0].getViaLaneID() if inside.getOutgoing() else ""
+        found.append((stretch, to))
+    return found
+
+
+def ways(net: typing.Any, lane: typing.Any, nodes: set[str], behind: tuple[str, ...] = ()) -> list[tuple[list[Stretch], typing.Any]]:
+    """The ways from a lane over the junctions of a zone, and the lanes between them, to lanes that lead out of it."""
+    found: list[tuple[list[Stretch], typing.Any]] = []
+    for stretch, to in onward(net, lane):
+        edge = to.getEdge()
+        if edge.getToNode().getID() not in nodes:
+            found.append(([stretch], to))
+        elif to.getID() not in behind:
+            name = word(to.getID())
+            between = Stretch(name, name, name, float(to.getLength()), list(to.getShape()), [(to.getID(), 0.0)])
+            further = ways(net, to, nodes, (*behind, to.getID()))
+            found += [([stretch, between, *rest], end) for rest, end in further]
+    return found
+
+
+def meets_itself(chain: Sequence[Stretch]) -> bool:
+    """Whether a way comes too near to itself, as one all the way round a narrow ring may: it would have to give way to itself."""
+    pairs = ((one, other) for at, one in enumerate(chain) for other in chain[at + 2 :] if one.shape and other.shape)
+    return any(near(one.shape, other.shape) for one, other in pairs)
+
+
+def add_lane(
+    net: typing.Any, zone: Zone, lane: typing.Any, approach_m: float, nodes: set[str], inner: dict[str, Stretch]
+) -> None:
+    """Adds an incoming lane, and the ways over the zone's junctions that begin on it."""
     entrance = word(lane.getID())
     length_m = float(lane.getLength())
     own_m = min(length_m, approach_m)
-    seen: set[str] = set()
-    for connection in lane.getOutgoing():
-        to, via = connection.getToLane(), connection.getViaLaneID()
-        if not (lane.allows("passenger") and to.allows("passenger")) or to.getID() in seen:
+    begins = False
+    for chain, to in ways(net, lane, nodes):
+        if meets_itself(chain):
             continue
-        seen.add(to.getID())
-        lanes, at_m = [(lane.getID(), own_m - length_m)], own_m
-        shape: list[Place] = []
-        while via:
-            inside = net.getLane(via)
-            lanes.append((via, at_m))
-            at_m += float(inside.getLength())
-            shape += [place for place in inside.getShape() if not shape or place != shape[-1]]
-            via = inside.getOutgoing()[0].getViaLaneID() if inside.getOutgoing() else ""
+        begins = True
+        lanes, at_m, segments = [(lane.getID(), own_m - length_m)], own_m, [entrance]
+        for stretch in chain:
+            lanes += [(name, at_m + from_m) for name, from_m in stretch.lanes]
+            at_m += stretch.length_m
+            if stretch.length_m > 0.0:
+                segments.append(stretch.name)
+                if stretch.name not in inner:
+                    inner[stretch.name] = stretch
+                    zone.segments.append(Segment(stretch.name, stretch.length_m, stretch.shape))
+            if stretch.start == stretch.end:
+                zone.v_max_mps = min(zone.v_max_mps, float(net.getLane(stretch.lanes[0][0]).getSpeed()))
         lanes.append((to.getID(), at_m))
-        name = f"{entrance[:30]}-{word(to.getID())[:30]}"
-        segments = [entrance]
-        if at_m > own_m:
-            zone.segments.append(Segment(name, at_m - own_m, shape))
-            inner[name] = shape
-            segments.append(name)
-        zone.paths.append(Path(name, segments, word(to.getID()), lanes, at_m))
-    if seen:
+        name, exit_ = f"{entrance[:30]}-{word(to.getID())[:30]}", word(to.getID())
+        alike = sum(path.name.split(".")[0] == name for path in zone.paths)
+        zone.paths.append(Path(f"{name}.{alike}" if alike else name, segments, exit_, lanes, at_m))
+    if begins:
         ends = cut(lane.getShape(), (length_m - own_m) / length_m)
         zone.segments.append(Segment(entrance, own_m, ends, road=f"{zone.name}-{entrance}"))
 
 
-def crossings(zone: Zone, inner: dict[str, list[Place]]) -> list[Crossing]:
-    """Where ways of different entrances are too near to each other.
+def crossings(zone: Zone, inner: dict[str, Stretch]) -> list[Crossing]:
+    """Where stretches that no path shares are too near to each other.
 
-    Ways to one exit merge at their ends, as scenarios have it; but bodies meet before that, so whoever waits is to wait
-    before the two ways come together. Ways from one entrance part where it ends.
+    Ways to one lane merge at their ends, as scenarios have it; but bodies meet before that, so whoever waits is to wait
+    before the two ways come together. Ways from one lane part where it ends.
     """
-    lengths = {segment.name: segment.length_m for segment in zone.segments}
+    shared = {(one, other) for path in zone.paths for one in path.segments for other in path.segments}
     found: list[Crossing] = []
-    ways = [path for path in zone.paths if len(path.segments) > 1]
-    for index, one in enumerate(ways):
-        for other in ways[index + 1 :]:
-            if one.segments[0] == other.segments[0]:
+    stretches = list(inner.values())
+    for index, one in enumerate(stretches):
+        for other in stretches[index + 1 :]:
+            if one.start == other.start or (one.name, other.name) in shared:
                 continue
-            names = (one.segments[1], other.segments[1])
-            parts = near(inner[names[0]], inner[names[1]])
+            parts = near(one.shape, other.shape)
             if parts is None:
                 continue
             (from_m, to_m), (other_from_m, other_to_m) = parts
             # Shapes are a little longer or shorter than what SUMO says of their lanes.
-            scale, other_scale = (lengths[name] / length(inner[name]) for name in names)
+            scale, other_scale = (stretch.length_m / length(stretch.shape) for stretch in (one, other))
             area_m = max((to_m - from_m) * scale, (other_to_m - other_from_m) * other_scale, 0.1)
-            at = {names[0]: from_m * scale, names[1]: other_from_m * other_scale}
+            at = {one.name: from_m * scale, other.name: other_from_m * other_scale}
             found.append(Crossing(f"c{len(found)}", area_m, at))
     return found
 

@@ -13,7 +13,7 @@ import libsumo
 from .._session import Error
 from ..world import GONE, Admitted, Newcomer, Traffic
 from .network import Place, cut
-from .simulation import Simulation, is_automated, program
+from .simulation import Car, Simulation, is_automated, program
 
 if typing.TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -165,6 +165,7 @@ class ReplicaTraffic(Traffic):
         self.seed = int(scenario["seed"])
         self.fleet = scenario["fleet"]
         self.routes: dict[tuple[str, ...], str] = {}
+        self.cars: dict[int, Car] = {}
         for index, kind in enumerate(self.fleet):
             self.add_types(index, kind["vehicle"])
 
@@ -183,17 +184,21 @@ class ReplicaTraffic(Traffic):
 
     def step(self, step: int, tasks: Sequence[tuple[float, int, int]]) -> tuple[Iterable[float], Sequence[Newcomer], bool]:
         """One step of SUMO."""
-        simulation = self.simulation
+        simulation, cars = self.simulation, self.cars
         for u_mps2, vehicle, is_held in tasks:
-            name = str(vehicle)
             if is_held:
-                simulation.hold(name, u_mps2)
-            else:
-                simulation.release(name)
+                simulation.hold(cars[vehicle], u_mps2)
+            elif vehicle in cars:
+                simulation.release(cars[vehicle])
         simulation.step()
         did: list[float] = []
         for _, vehicle, _ in tasks:
-            did.extend(simulation.moved(str(vehicle)) or GONE)
+            car = cars.get(vehicle)
+            if car is not None and simulation.moves(car):
+                did += (car.advanced_m, car.v_mps)
+            else:
+                cars.pop(vehicle, None)
+                did.extend(GONE)
         return did, (), False
 
     def admit(self, vehicles: Sequence[Admitted]) -> Sequence[bool]:
@@ -213,7 +218,8 @@ class ReplicaTraffic(Traffic):
             vehicles_.setPreviousSpeed(name, v_mps)
             if is_commanded:
                 vehicles_.setSpeedFactor(name, 1.0)
-            self.simulation.see(name)
+            self.cars[vehicle] = car = Car(name)
+            self.simulation.see(car)
             self.simulation.began_s[name] = libsumo.simulation.getTime()
             self.simulation.totals.departed += 1
             commanded.append(is_commanded)
