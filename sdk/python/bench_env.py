@@ -1,6 +1,6 @@
 """Environment steps per second, beside SUMO's with the same arrivals on roads of the same shape.
 
-Usage: python3 sdk/python/bench_env.py [SECONDS]   (per figure; 10 by default)
+Usage: python3 -I sdk/python/bench_env.py [SECONDS]   (per figure; 10 by default; -I takes the package that is installed)
 
 Needs `control_zones.env`, and eclipse-sumo and libsumo for what is beside it (`pip install eclipse-sumo libsumo traci`). Every
 step shows where all vehicles are and how fast, and gives each an acceleration; SUMO is told by one call per vehicle, as it has no

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -68,6 +69,10 @@ def check(wheel: Path, place: Path) -> None:
     if summary["state_hash"] == state_hash:
         raise SystemExit("the controller in Python changed nothing")
     empty.ran("cz plugin check of it", "cz", "plugin", "check", "--", "python", str(EXAMPLE))
+    if shutil.which("cc") and shutil.which("make"):
+        empty.ran("cz plugin new c", "cz", "plugin", "new", "c", "own")
+        empty.ran("make of it", "make", "-C", "own")
+        empty.ran("cz plugin check of that", "cz", "plugin", "check", "--", "own/controller")
     empty.ran("cz report", "cz", "report", "run.czlog", "--out", "run.html")
     empty.ran("cz export", "cz", "export", "run.czlog", "--to", "parquet")
     empty.ran("what environments need installed", *install, f"{wheel}[env]")

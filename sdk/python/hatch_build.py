@@ -1,4 +1,4 @@
-"""Puts programs and library of a release build into the wheel where `CZ_PROGRAMS` names their directory.
+"""Puts programs and libraries of a release build into the wheel where `CZ_PROGRAMS` names their directory.
 
 Without it the wheel is pure Python, so that `pip install ./sdk/python` needs no Rust.
 """
@@ -18,6 +18,8 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
 #: What `control_zones.env` loads.
 LIBRARY = "libcontrol_zones_env.so"
+#: What controllers in C and C++ are linked with, which `cz sdk install` finds in `lib` beside the folder of the programs.
+C_LIBRARY = "libcontrol_zones_c.so"
 PROGRAMS = ("cz", "cz-world", "cz-coord", "cz-ctrl", "cz-export", "cz-report", "cz-sweep", "cz-view", "cz-top")
 
 
@@ -31,12 +33,12 @@ class Programs(BuildHookInterface):  # type: ignore[type-arg]
         named = os.environ.get("CZ_PROGRAMS")
         if not named or version == "editable":
             return
-        found = [Path(named).resolve() / program for program in (*PROGRAMS, LIBRARY)]
+        found = [Path(named).resolve() / program for program in (*PROGRAMS, LIBRARY, C_LIBRARY)]
         missing = [path.name for path in found if not path.is_file()]
         if missing:
             raise SystemExit(
                 f"CZ_PROGRAMS={named}: {', '.join(missing)} not there; expected the directory of "
-                "`cargo build --release --workspace --bins` and `-p control-zones-env`, such as target/release"
+                "`cargo build --release --workspace --bins` and `-p control-zones-env -p control-zones-c`, such as target/release"
             )
         self._copies = tempfile.TemporaryDirectory(prefix="cz-wheel-")
         glibc = 17
@@ -46,6 +48,8 @@ class Programs(BuildHookInterface):  # type: ignore[type-arg]
             subprocess.run(["strip", str(copy)], check=True)
             if path.name == LIBRARY:
                 build_data["force_include"][str(copy)] = f"control_zones/{LIBRARY}"
+            elif path.name == C_LIBRARY:
+                build_data["shared_data"][str(copy)] = f"lib/{C_LIBRARY}"
             else:
                 build_data["shared_scripts"][str(copy)] = path.name
             glibc = max(glibc, *needed_glibc(copy))

@@ -7,7 +7,7 @@ cd "$(dirname "$0")/../.."
 out=${1:-target/wheels}
 if [ -z "${CZ_PROGRAMS:-}" ]; then
     cargo build --release --workspace --bins
-    cargo build --release -p control-zones-env
+    cargo build --release -p control-zones-env -p control-zones-c
     CZ_PROGRAMS=${CARGO_TARGET_DIR:-target}/release
 fi
 # It is built elsewhere.

@@ -20,8 +20,8 @@ const FILES: [(&str, &str); 6] = [
     ("lib/pkgconfig/control-zones.pc", include_str!("../../sdk/control-zones.pc")),
 ];
 
-/// The libraries, which are built next to this program: the shared one has its version in its name where it is
-/// installed.
+/// The libraries, which are built next to this program, or come with it as a wheel has them: the shared one alone, in `lib`
+/// beside the folder of the program. It has its version in its name where it is installed.
 const SHARED: &str = "libcontrol_zones_c.so";
 const STATIC: &str = "libcontrol_zones_c.a";
 
@@ -52,8 +52,14 @@ pub(super) fn sdk(command: &SdkCommand) -> Result<(), AppError> {
     };
     let (version, interface) = (env!("CARGO_PKG_VERSION"), interface());
     let full = format!("{SHARED}.{version}");
-    for (library, name) in [(SHARED, full.as_str()), (STATIC, STATIC)] {
-        let from = beside.join(library);
+    let shipped = beside.join("../lib");
+    let is_shipped = !beside.join(SHARED).exists() && shipped.join(SHARED).exists();
+    let (from, libraries) = match is_shipped {
+        true => (shipped.as_path(), &[(SHARED, full.as_str())][..]),
+        false => (beside, &[(SHARED, full.as_str()), (STATIC, STATIC)][..]),
+    };
+    for (library, name) in libraries {
+        let from = from.join(library);
         let contents = std::fs::read(&from).map_err(|e| {
             let build = "build it with `cargo build --release -p control-zones-c`";
             AppError::Failed(format!("{}: {e}; {build}", from.display()))

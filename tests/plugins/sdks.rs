@@ -246,6 +246,17 @@ fn sdk_install_installs_all_it_says_and_otherwise_says_what_to_build() {
     let said = String::from_utf8(output.stderr).unwrap();
     assert!(said.contains("libcontrol_zones_c.so: "), "{said}");
     assert!(said.contains("cargo build --release -p control-zones-c"), "{said}");
+    // A wheel has the shared one in another folder, and not the static one.
+    let installed_as = elsewhere.path().join("bin");
+    for folder in ["bin", "lib"] {
+        std::fs::create_dir(elsewhere.path().join(folder)).unwrap();
+    }
+    std::fs::rename(&program, installed_as.join("cz")).unwrap();
+    let shared = "libcontrol_zones_c.so";
+    std::fs::copy(prefix.join("lib").join(shared), elsewhere.path().join("lib").join(shared)).unwrap();
+    let mut command = Command::new(installed_as.join("cz"));
+    let said = output_of(command.args(["sdk", "install", "--prefix"]).arg(elsewhere.path().join("to")));
+    assert_eq!(said.lines().count(), 9, "{said}");
 }
 
 /// What a command prints; it must succeed.
