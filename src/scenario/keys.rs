@@ -379,8 +379,8 @@ pub(in crate::scenario) static TRACE: Keys = &[
         "trace",
         "text",
         "this or `rates` is required",
-        "one of the traces that come with the program (`sumo-400-1` to `-23`, `sumo-varying-1` to `-23`), or a CSV file \
-         with the header `time_s,road,speed_mps`, and `route` as a fourth column if some rows name one of the road's, \
+        "one of the traces that come with the program (`sumo-400-1` to `-23`, `sumo-600-4` to `-23`, `sumo-varying-1` to \
+         `-23`), or a CSV file with the header `time_s,road,speed_mps`, and `route` as a fourth column if some rows name one of the road's, \
          rows in order of time; a road takes its own rows. Relative to the scenario file. `{seed}` in it is replaced by \
          the seed",
     ),
