@@ -449,7 +449,10 @@ fn whoever_is_infeasible_entered_without_room_to_stop() {
     let flow = "zones.*.flow={policy=\"none\"}";
     let sets = ["control.law=viable", "coordination.schedule=pooled", "coordination.order=resequenced", flow];
     let mut found = 0;
-    for seed in [18, 112] {
+    // Random demands, and dense traffic of SUMO's drivers.
+    let traces = (4..=23).map(|seed| (seed, Some("roads.*.demand.trace=sumo-600-{seed}")));
+    for (seed, trace) in [(18, None), (112, None)].into_iter().chain(traces) {
+        let sets: Vec<&str> = sets.into_iter().chain(trace).collect();
         let paper = Arc::new(scenario("paper", &sets, seed));
         let bodies = Shield::of_bodies(&paper.vehicle, paper.dt_s());
         let gap_m = paper.vehicle.length_m + paper.control.viable.clearance_m;
@@ -488,5 +491,5 @@ fn whoever_is_infeasible_entered_without_room_to_stop() {
         assert_eq!(gated.zones.iter().map(|z| z.infeasible_vehicles).sum::<u32>(), 0, "seed {seed}");
         assert_eq!((gated.departed, gated.overlaps.pairs), (120, 0), "seed {seed}");
     }
-    assert!(found > 0, "nobody was infeasible: the seeds show nothing any more");
+    assert!(found > 20, "{found} infeasible steps: the seeds show nothing any more");
 }
