@@ -756,7 +756,9 @@ fn missing_scenarios_and_seeds() {
     let message = error(load(None, &[set], Some(7)));
     assert!(message.contains("roads.main1.demand.trace = \"arrivals-{seed}.csv\""), "{message}");
     assert!(
-        message.contains("expected an arrival trace for seed 7: a file, or one of the embedded sumo-400-1 to -23, "),
+        message.contains(
+            "expected an arrival trace for seed 7: a file, or one of the embedded sumo-400-1 to -23, "
+        ),
         "{message}"
     );
     let dir = tempfile::tempdir().unwrap();
