@@ -89,6 +89,23 @@ pub(super) fn number_of_cores() -> usize {
     *CORES.get_or_init(|| std::thread::available_parallelism().map_or(1, usize::from))
 }
 
+/// Number of cores of the machine, whoever may use them.
+pub(super) fn cores_online() -> usize {
+    static CORES: OnceLock<usize> = OnceLock::new();
+    // "0-3,8": ranges and single cores.
+    let count = |list: String| {
+        let bounds = |range: &str| -> Option<usize> {
+            let (first, last) = range.split_once('-').unwrap_or((range, range));
+            Some(last.parse::<usize>().ok()? + 1 - first.parse::<usize>().ok()?)
+        };
+        list.trim().split(',').map(bounds).sum::<Option<usize>>()
+    };
+    *CORES.get_or_init(|| {
+        let list = std::fs::read_to_string("/sys/devices/system/cpu/online").ok();
+        list.and_then(count).unwrap_or_else(number_of_cores)
+    })
+}
+
 /// How long the cores the calling thread may use have been idle so far, in all, ns; 0 where the system does not tell.
 /// Allocates nothing.
 pub(super) fn idle_ns() -> u64 {

@@ -1,8 +1,8 @@
 //! How a process waits for a frame: busily at first, then asleep, never for ever.
 
-use super::placement::{idle_ns, number_of_cores};
+use super::placement::{cores_online, idle_ns, number_of_cores};
 use super::realtime::{Breather, is_fifo};
-use super::wait_policy::{Advice, Situation, WaitPolicy};
+use super::wait_policy::{Advice, Cores, Situation, WaitPolicy};
 use super::{Peers, ProcessError, StopFlag};
 use crate::lockstep::{Awaited, Handover, LockstepError, Progress};
 use crate::own_time::LONGEST_PAUSE;
@@ -10,6 +10,7 @@ use crate::scenario::ControllerNames;
 use crate::trace::{self, Phase};
 use crate::transport::iox::{Bell, BellRope, monotonic_ns};
 use ipc_schemas::{Role, WAITING_ADAPTIVE, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
+use std::io::Read;
 use std::time::{Duration, Instant};
 
 /// How the processes of a run wait for each other's frames.
@@ -80,8 +81,8 @@ enum Manner {
         /// Time after which yielding ends too and sleeping begins.
         busy: Duration,
     },
-    /// As experience tells.
-    Learned(WaitPolicy),
+    /// As experience tells; where more processes than this want to run, somebody else does.
+    Learned(WaitPolicy, usize),
 }
 
 /// Frames are sure to come within this time while all is well; beyond it, spinning is a waste.
@@ -103,7 +104,10 @@ impl Patience {
         let manner = match mode {
             WaitMode::Block => Manner::ASLEEP,
             WaitMode::Adaptive | WaitMode::Hybrid if role == Role::Coordinator => Manner::ASLEEP,
-            WaitMode::Adaptive => Manner::Learned(WaitPolicy::new(Situation { shares_cores, may_yield })),
+            WaitMode::Adaptive => Manner::Learned(
+                WaitPolicy::new(Situation { shares_cores, may_yield }),
+                hot_processes.max(cores_online()),
+            ),
             // More spinners than cores would only keep each other from working.
             WaitMode::Hybrid if shares_cores => Manner::Fixed { spin: Duration::ZERO, busy },
             WaitMode::Hybrid => Manner::Fixed { spin: SPIN, busy },
@@ -120,14 +124,24 @@ impl Manner {
     fn begins_spinning(&self, gives_way: bool) -> bool {
         match self {
             Manner::Fixed { spin, busy } => !(spin.is_zero() || gives_way && spin < busy),
-            Manner::Learned(policy) => policy.begins_spinning(gives_way),
+            Manner::Learned(policy, _) => policy.begins_spinning(gives_way),
         }
     }
 
     /// Whether the time each yield takes says something.
     fn times_yields(&self) -> bool {
-        matches!(self, Manner::Learned(_))
+        matches!(self, Manner::Learned(..))
     }
+}
+
+/// Whether more processes than this want to run; not where the system does not tell.
+fn more_run_than(room: usize) -> bool {
+    // See proc(5): the fourth field is those that run or wait to run, a slash, and all there are.
+    let mut text = [0; 64];
+    let length = std::fs::File::open("/proc/loadavg").and_then(|mut file| file.read(&mut text)).unwrap_or(0);
+    let load = std::str::from_utf8(&text[..length]).unwrap_or_default();
+    let runnable = load.split_whitespace().nth(3).and_then(|field| field.split('/').next()?.parse().ok());
+    runnable.is_some_and(|runnable: usize| runnable > room)
 }
 
 /// A driver of a participant.
@@ -219,7 +233,7 @@ impl Waiter {
             return;
         }
         self.advice = None;
-        if let Manner::Learned(policy) = &mut self.patience.manner {
+        if let Manner::Learned(policy, _) = &mut self.patience.manner {
             policy.came(monotonic_ns);
         }
         if self.since.take().is_none() {
@@ -258,7 +272,11 @@ impl Waiter {
                         _ => Advice::Sleep,
                     }
                 }
-                Manner::Learned(policy) => policy.look(now, gives_way, idle_ns),
+                Manner::Learned(policy, room) => {
+                    let room = *room;
+                    policy
+                        .look(now, gives_way, || Cores { idle_ns: idle_ns(), are_full: more_run_than(room) })
+                }
             });
         }
         match self.advice {
@@ -284,7 +302,7 @@ impl Waiter {
         }
         self.lies_down = false;
         let rung_at = bell.sleep(bound(BELL_NAP));
-        if let Manner::Learned(policy) = &mut self.patience.manner {
+        if let Manner::Learned(policy, _) = &mut self.patience.manner {
             policy.slept(monotonic_ns(), rung_at);
         }
     }

@@ -10,7 +10,8 @@
 //! waiter sleeps at once for some waits, more each time; where it pays, for fewer.
 //!
 //! A core is crowded when a spinning waiter finds a hole in its own time, or a yield takes as long as others'
-//! turns do: one such turn costs as much as a thousand steps. Before it is taken to be free again, the cores must have
+//! turns do: one such turn costs as much as a thousand steps; and at first when more processes want to run than there
+//! is room for. Before it is taken to be free again, the cores must have
 //! had idle time, which they have among waiters that sleep, and have not beside work that never ends.
 //!
 //! Times are nanoseconds on one clock, and are given; so the policy can be tested without waiting.
@@ -24,6 +25,15 @@ pub(super) enum Advice {
     Yield,
     /// Sleep until rung.
     Sleep,
+}
+
+/// What the machine tells of the cores that the waiter may use.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Cores {
+    /// How long they have been idle so far, in all.
+    pub idle_ns: u64,
+    /// More processes want to run than there are cores, and this run may want.
+    pub are_full: bool,
 }
 
 /// What is known of a waiter's situation from the start.
@@ -73,7 +83,7 @@ struct Crowd {
     hold_ns: u64,
     is_there: bool,
     /// When the idle time of the cores was asked for last, and what it was.
-    asked: u64,
+    asked: Option<u64>,
     idle_ns: u64,
 }
 
@@ -113,7 +123,7 @@ impl WaitPolicy {
         WaitPolicy {
             situation,
             wake_cost_ns: WAKE_COST,
-            crowd: Crowd { until: 0, hold_ns: LEAST_HOLD, is_there: false, asked: 0, idle_ns: 0 },
+            crowd: Crowd { until: 0, hold_ns: LEAST_HOLD, is_there: false, asked: None, idle_ns: 0 },
             in_vain: 0,
             sleeps_left: 0,
             sleeps: 1,
@@ -127,8 +137,8 @@ impl WaitPolicy {
     }
 
     /// The waiter looks up: what now? `gives_way` when it waits for a process that has just been woken, perhaps
-    /// on this core; `idle_ns` tells how long the cores have been idle so far.
-    pub(super) fn look(&mut self, now: u64, gives_way: bool, idle_ns: impl Fn() -> u64) -> Advice {
+    /// on this core; `cores` asks the machine.
+    pub(super) fn look(&mut self, now: u64, gives_way: bool, cores: impl Fn() -> Cores) -> Advice {
         let mut wait = self.wait.unwrap_or(Wait {
             since: now,
             last_look: now,
@@ -140,12 +150,12 @@ impl WaitPolicy {
         });
         let away = now.saturating_sub(wait.last_look);
         match wait.last {
-            Advice::Spin if away > HOLE => self.crowd.seen(now, &idle_ns),
-            Advice::Yield if away > TURN => self.crowd.seen(now, &idle_ns),
+            Advice::Spin if away > HOLE => self.crowd.seen(now, &cores),
+            Advice::Yield if away > TURN => self.crowd.seen(now, &cores),
             Advice::Yield if away > SHARED && !self.needs_core(wait.gives_way) => wait.slept = true,
             _ => {}
         }
-        let is_crowded = self.crowd.is_there(now, &idle_ns);
+        let is_crowded = self.crowd.is_there(now, &cores);
         let advice = self.advise(&mut wait, now, gives_way, is_crowded);
         self.wait = Some(Wait { last: advice, last_look: now, ..wait });
         advice
@@ -226,25 +236,32 @@ impl WaitPolicy {
 }
 
 impl Crowd {
-    fn seen(&mut self, now: u64, idle_ns: impl Fn() -> u64) {
+    fn seen(&mut self, now: u64, cores: impl Fn() -> Cores) {
         if !self.is_there {
             // Back soon after it was taken to be gone: it is here to stay.
             let soon = now < self.until + 4 * self.hold_ns;
             self.hold_ns =
                 if soon && self.until > 0 { (2 * self.hold_ns).min(GREATEST_HOLD) } else { LEAST_HOLD };
-            (self.asked, self.idle_ns) = (now, idle_ns());
+            (self.asked, self.idle_ns) = (Some(now), cores().idle_ns);
         }
         self.is_there = true;
         self.until = now + self.hold_ns;
     }
 
-    fn is_there(&mut self, now: u64, idle_ns: impl Fn() -> u64) -> bool {
+    fn is_there(&mut self, now: u64, cores: impl Fn() -> Cores) -> bool {
+        let Some(asked) = self.asked else {
+            // Nothing is known yet: whoever spins from the beginning loses turns before it learns better.
+            let Cores { idle_ns, are_full } = cores();
+            (self.asked, self.idle_ns, self.is_there) = (Some(now), idle_ns, are_full);
+            self.until = if are_full { now + self.hold_ns } else { 0 };
+            return are_full;
+        };
         if self.is_there && now >= self.until {
-            let idle_ns = idle_ns();
+            let idle_ns = cores().idle_ns;
             let idle_since_ns = idle_ns.saturating_sub(self.idle_ns);
-            self.is_there = idle_since_ns < (now - self.asked) / IDLE_SHARE;
+            self.is_there = idle_since_ns < (now - asked) / IDLE_SHARE;
             if self.is_there {
-                (self.asked, self.idle_ns) = (now, idle_ns);
+                (self.asked, self.idle_ns) = (Some(now), idle_ns);
                 self.until = now + self.hold_ns;
             }
         }
@@ -284,7 +301,7 @@ mod tests {
         fn look(&mut self, gives_way: bool) -> Advice {
             // A core is idle for half of the time, or never.
             let idle_ns = if self.is_busy { 0 } else { self.now / 2 };
-            self.policy.look(self.now, gives_way, || idle_ns)
+            self.policy.look(self.now, gives_way, || Cores { idle_ns, are_full: self.is_busy })
         }
 
         /// A wait for a frame that comes after `ns`; polls are 1 us apart, yields take as long as `turn`.
@@ -373,7 +390,6 @@ mod tests {
         let mut random = 1_u64;
         for early_of_100 in [0, 10, 50, 90, 100] {
             let mut scene = Scene::new(ALONE, true);
-            scene.is_preempted(3 * MS);
             let (mut ours, mut spinning, mut sleeping) = (0, 0, 0);
             for _ in 0..20_000 {
                 random = random.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
