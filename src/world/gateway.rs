@@ -5,9 +5,8 @@
 //! upstream, within a zone in passing order. So the motion of every partner is settled before the vehicles
 //! that depend on it, and the result does not depend on the order in which frames came.
 
-use super::car::{Beyond, Car};
+use super::command_fault::CommandFault;
 use super::faults::Limits;
-use super::link::LinkCar;
 use super::metrics::{ShieldRow, ShieldSummary};
 use super::owed::Standing;
 use super::role::World;
@@ -15,174 +14,8 @@ use crate::conflict::DutyKind;
 use crate::lists::AHEAD;
 use crate::scenario::{Drivers, Scenario, ShieldMode};
 use crate::shield::{Partner, Row, Shield};
-use crate::vehicle::Held;
 use ipc_schemas::{self as frames, Feedback, VehicleCommand};
 use std::collections::HashMap;
-
-/// A command frame the world cannot take.
-#[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
-pub enum CommandFault {
-    /// The vehicle is not a member of any zone: it never existed, is on a link, or has left.
-    #[error("record {record}, field vehicle: vehicle {vehicle} is in no zone")]
-    UnknownVehicle {
-        /// Place in the frame.
-        record: usize,
-        /// Vehicle named.
-        vehicle: u32,
-    },
-    /// Another controller drives the vehicle.
-    #[error("record {record}, field vehicle: vehicle {vehicle} is driven by controller {driver}")]
-    ForeignVehicle {
-        /// Place in the frame.
-        record: usize,
-        /// Vehicle named.
-        vehicle: u32,
-        /// Index of the controller that drives it.
-        driver: u32,
-    },
-    /// The frame commands the vehicle twice.
-    #[error("record {record}, field vehicle: vehicle {vehicle} is commanded twice")]
-    Duplicate {
-        /// Place in the frame of the second.
-        record: usize,
-        /// Vehicle named.
-        vehicle: u32,
-    },
-    /// A vehicle of the sender has no command where it should have one.
-    #[error("record {record}, field vehicle: vehicle {vehicle} of zone {zone} has no command there")]
-    MissingVehicle {
-        /// Place in the frame at which it was expected.
-        record: usize,
-        /// The vehicle.
-        vehicle: u32,
-        /// Its zone.
-        zone: u32,
-    },
-    /// The record names a zone the vehicle is not in.
-    #[error("record {record}, field zone: vehicle {vehicle} is in zone {expected}, not {zone}")]
-    OtherZone {
-        /// Place in the frame.
-        record: usize,
-        /// The vehicle.
-        vehicle: u32,
-        /// Zone named.
-        zone: u32,
-        /// Zone the vehicle is in.
-        expected: u32,
-    },
-    /// The acceleration is not a number.
-    #[error("record {record}, field u_mps2: vehicle {vehicle} is commanded {u_mps2}")]
-    NotFinite {
-        /// Place in the frame.
-        record: usize,
-        /// The vehicle.
-        vehicle: u32,
-        /// Acceleration commanded.
-        u_mps2: f64,
-    },
-    /// The acceleration is not within the vehicle's limits.
-    #[error(
-        "record {record}, field u_mps2: vehicle {vehicle} is commanded {u_mps2} m/s^2, which is not within \
-         [{min_mps2}, {max_mps2}]"
-    )]
-    OutOfLimits {
-        /// Place in the frame.
-        record: usize,
-        /// The vehicle.
-        vehicle: u32,
-        /// Acceleration commanded.
-        u_mps2: f64,
-        /// Least allowed.
-        min_mps2: f64,
-        /// Greatest allowed.
-        max_mps2: f64,
-    },
-    /// The verdict is one that only the world gives, or has no meaning.
-    #[error(
-        "record {record}, field verdict: vehicle {vehicle} has verdict {verdict}, expected 0 to {}",
-        frames::VERDICT_INFEASIBLE
-    )]
-    BadVerdict {
-        /// Place in the frame.
-        record: usize,
-        /// The vehicle.
-        vehicle: u32,
-        /// Verdict claimed.
-        verdict: u16,
-    },
-    /// The planned exit, which other vehicles may read, is not a number.
-    #[error("record {record}, field {}: vehicle {vehicle} has {value}", if *is_speed { "planned_exit_speed_mps" } else { "planned_exit_time_s" })]
-    BadIntent {
-        /// Place in the frame.
-        record: usize,
-        /// The vehicle.
-        vehicle: u32,
-        /// Whether it is the speed, and not the instant.
-        is_speed: bool,
-        /// What was sent.
-        value: f64,
-    },
-}
-
-impl CommandFault {
-    /// The same as a controller is told it; step and controller are for the caller to fill in.
-    pub fn feedback(&self) -> Feedback {
-        let told = |record: usize, vehicle, rule, field| Feedback {
-            record: record as u32,
-            vehicle,
-            rule,
-            field,
-            zone: frames::NO_ZONE,
-            toward: frames::NO_VEHICLE,
-            ..Feedback::default()
-        };
-        use CommandFault as Fault;
-        match *self {
-            Fault::UnknownVehicle { record, vehicle } => {
-                told(record, vehicle, frames::RULE_UNKNOWN, frames::FIELD_VEHICLE)
-            }
-            Fault::ForeignVehicle { record, vehicle, .. } => {
-                told(record, vehicle, frames::RULE_FOREIGN, frames::FIELD_VEHICLE)
-            }
-            Fault::Duplicate { record, vehicle } => {
-                told(record, vehicle, frames::RULE_TWICE, frames::FIELD_VEHICLE)
-            }
-            Fault::MissingVehicle { record, vehicle, zone } => {
-                Feedback { zone, ..told(record, vehicle, frames::RULE_MISSING, frames::FIELD_VEHICLE) }
-            }
-            Fault::OtherZone { record, vehicle, zone, expected } => Feedback {
-                value: f64::from(zone),
-                least: f64::from(expected),
-                greatest: f64::from(expected),
-                zone: expected,
-                ..told(record, vehicle, frames::RULE_OTHER, frames::FIELD_ZONE)
-            },
-            Fault::NotFinite { record, vehicle, .. } => {
-                told(record, vehicle, frames::RULE_NOT_FINITE, frames::FIELD_U_MPS2)
-            }
-            Fault::OutOfLimits { record, vehicle, u_mps2, min_mps2, max_mps2 } => Feedback {
-                value: u_mps2,
-                least: min_mps2,
-                greatest: max_mps2,
-                ..told(record, vehicle, frames::RULE_LIMITS, frames::FIELD_U_MPS2)
-            },
-            Fault::BadVerdict { record, vehicle, verdict } => Feedback {
-                value: f64::from(verdict),
-                greatest: f64::from(frames::VERDICT_INFEASIBLE),
-                ..told(record, vehicle, frames::RULE_LIMITS, frames::FIELD_VERDICT)
-            },
-            Fault::BadIntent { record, vehicle, is_speed, .. } => {
-                let fields = [frames::FIELD_PLANNED_EXIT_TIME_S, frames::FIELD_PLANNED_EXIT_SPEED_MPS];
-                told(record, vehicle, frames::RULE_NOT_FINITE, fields[usize::from(is_speed)])
-            }
-        }
-    }
-}
-
-/// A vehicle that leaves the network more slowly speeds up to this outside, m/s.
-const LEAST_EXIT_MPS: f64 = 5.0;
-/// How it does, m/s^2.
-const EXIT_MPS2: f64 = 2.0;
 
 /// What the world has vehicles do in place of their controller.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -242,6 +75,11 @@ impl Gateway {
     /// Whether the commands of this step are applied as they are.
     pub(super) fn is_off(&self) -> bool {
         self.mode == ShieldMode::Off && !self.falls_back
+    }
+
+    /// The shields of vehicles on links, by kind, if these are shielded.
+    pub(super) fn shields_of_links(&self) -> Option<&[Shield]> {
+        (self.mode == ShieldMode::On).then_some(&self.shields)
     }
 
     pub(super) fn summary(&self) -> ShieldSummary {
@@ -499,59 +337,6 @@ impl World {
         self.gateway.falls_back = false;
     }
 
-    /// Those that have left a zone move with the vehicles they stand for. With `settling`, what is not settled yet
-    /// is taken for full braking until it is.
-    pub(super) fn hold_left(&mut self, scenario: &Scenario, zone: usize, settling: bool) {
-        for at in 0..self.zones[zone].first() {
-            let Followed { u_mps2, is_settled } = self.followed(scenario, zone, at);
-            let car = &mut self.cars[zone][at];
-            car.command_mps2 = u_mps2;
-            if settling && !is_settled {
-                car.command_mps2 = self.kinds[usize::from(car.kind)].u_min_mps2;
-                self.scratch.assumed.push((zone as u32, at));
-            }
-        }
-    }
-
-    /// What a vehicle that left a zone holds over the step, wherever it is now.
-    fn followed(&mut self, scenario: &Scenario, zone: usize, at: usize) -> Followed {
-        let mut car = self.cars[zone][at];
-        let followed = self.follow(scenario, zone, &mut car);
-        self.cars[zone][at].beyond = car.beyond;
-        followed
-    }
-
-    /// The same, of a vehicle that need not be among the zone's; it is told how far it has come.
-    pub(super) fn follow(&self, scenario: &Scenario, zone: usize, car: &mut Car) -> Followed {
-        let Car { vehicle, v_mps, kind, mut beyond, .. } = *car;
-        let found = loop {
-            if self.links.cars > 0
-                && let Some(link) = self.links.behind(beyond.zone, beyond.exit)
-                && let Some(on_link) = self.links.all[link].cars.iter().find(|c| c.car.vehicle == vehicle)
-            {
-                break Some((on_link.held.u_mps2, beyond.zone as usize >= zone));
-            }
-            let exit = &scenario.network.zones[beyond.zone as usize].exits[beyond.exit as usize];
-            let Some(to) = exit.to else { break None };
-            if let Some(car) = self.members(to.zone as usize).iter().rev().find(|c| c.vehicle == vehicle) {
-                beyond.next_exit = self.conflicts[to.zone as usize].exit(car.path);
-                break Some((car.command_mps2, to.zone as usize > zone));
-            }
-            beyond = Beyond { zone: to.zone, exit: beyond.next_exit, next_exit: 0 };
-        };
-        car.beyond = beyond;
-        match found {
-            Some((u_mps2, is_settled)) => Followed { u_mps2, is_settled },
-            // Out of the network nobody drives it. Whoever left it creeping must not creep for ever: those behind
-            // would have to leave more slowly each, down to a standstill.
-            None if v_mps < LEAST_EXIT_MPS => {
-                let u_max_mps2 = self.kinds[usize::from(kind)].u_max_mps2;
-                Followed { u_mps2: EXIT_MPS2.min(u_max_mps2), is_settled: true }
-            }
-            None => Followed { u_mps2: 0.0, is_settled: true },
-        }
-    }
-
     /// Projects the commands of a zone's members, in passing order.
     fn shield_zone(&mut self, zone: usize) {
         let Gateway { mode, shields, drivers, rows, partners, feedback, .. } = &mut self.gateway;
@@ -632,57 +417,4 @@ impl World {
             }
         }
     }
-
-    /// Lets the vehicles on a link choose, front first, so that each sees what its leader will do.
-    fn drive_link(&mut self, scenario: &Scenario, zone: usize, link: usize, dt_s: f64) {
-        if self.links.all[link].cars.is_empty() {
-            return;
-        }
-        let to = self.links.all[link].to;
-        let there = &scenario.network.zones[to.zone as usize];
-        let enters = |path: u32| there.paths[path as usize].segments[0] == to.segment;
-        let last = self.members(to.zone as usize).iter().rev().find(|c| enters(c.path));
-        // In a network that closes a circle the zone there may not be settled yet.
-        let is_settled = to.zone as usize > zone;
-        let mut leader = last.map(|c| {
-            let u_mps2 = if is_settled && c.is_commanded {
-                c.command_mps2
-            } else {
-                self.kinds[usize::from(c.kind)].u_min_mps2
-            };
-            (Held::new(c.x_m + to.link_m, c.v_mps, u_mps2), c.kind)
-        });
-        let Gateway { mode, shields, .. } = &self.gateway;
-        for LinkCar { car, held } in &mut self.links.all[link].cars {
-            let k = scenario.control.k_rear_end_per_s;
-            let own = &self.kinds[usize::from(car.kind)];
-            let gap_m = |other: u16| {
-                let extra_m = self.kinds[usize::from(other)].length_m - scenario.vehicle.length_m;
-                own.standstill_gap_m + extra_m.max(0.0)
-            };
-            let ahead = leader.map(|(motion, kind)| (motion, gap_m(kind)));
-            let mut u = super::link::drive(car, to.link_speed_mps, ahead, own, k, dt_s);
-            if *mode == ShieldMode::On {
-                let partner = leader.map(|(motion, kind)| Partner {
-                    kind: DutyKind::RearEnd,
-                    at_m: 0.0,
-                    gap_m: gap_m(kind),
-                    braking_mps2: -self.kinds[usize::from(kind)].u_min_mps2,
-                    motion,
-                });
-                let shield = &shields[usize::from(car.kind)];
-                u = shield.project(car.x_m, car.v_mps, u, partner.into_iter()).u_mps2;
-            }
-            *held = Held::new(car.x_m, car.v_mps, u);
-            leader = Some((*held, car.kind));
-        }
-    }
-}
-
-/// What a vehicle that left a zone holds over the step.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Followed {
-    pub u_mps2: f64,
-    /// Whether that is settled when the zone it left is about to be.
-    is_settled: bool,
 }

@@ -1,7 +1,10 @@
 //! Plain links between zones: uncontrolled road on which vehicles follow at their own discretion.
 
 use super::car::Car;
-use crate::scenario::{Downstream, Network, VehicleParams, ZoneId};
+use super::role::World;
+use crate::conflict::DutyKind;
+use crate::scenario::{Downstream, Network, Scenario, VehicleParams, ZoneId};
+use crate::shield::Partner;
 use crate::vehicle::{Held, Pair, RearEnd};
 
 /// A link and its vehicles, front first.
@@ -58,10 +61,57 @@ impl Links {
 /// Time constant with which a vehicle on a link goes over to the link's speed, s.
 const RECOVERY_S: f64 = 2.0;
 
+impl World {
+    /// Lets the vehicles on a link choose, front first, so that each sees what its leader will do.
+    pub(super) fn drive_link(&mut self, scenario: &Scenario, zone: usize, link: usize, dt_s: f64) {
+        if self.links.all[link].cars.is_empty() {
+            return;
+        }
+        let to = self.links.all[link].to;
+        let there = &scenario.network.zones[to.zone as usize];
+        let enters = |path: u32| there.paths[path as usize].segments[0] == to.segment;
+        let last = self.members(to.zone as usize).iter().rev().find(|c| enters(c.path));
+        // In a network that closes a circle the zone there may not be settled yet.
+        let is_settled = to.zone as usize > zone;
+        let mut leader = last.map(|c| {
+            let u_mps2 = if is_settled && c.is_commanded {
+                c.command_mps2
+            } else {
+                self.kinds[usize::from(c.kind)].u_min_mps2
+            };
+            (Held::new(c.x_m + to.link_m, c.v_mps, u_mps2), c.kind)
+        });
+        let shields = self.gateway.shields_of_links();
+        for LinkCar { car, held } in &mut self.links.all[link].cars {
+            let k = scenario.control.k_rear_end_per_s;
+            let own = &self.kinds[usize::from(car.kind)];
+            let gap_m = |other: u16| {
+                let extra_m = self.kinds[usize::from(other)].length_m - scenario.vehicle.length_m;
+                own.standstill_gap_m + extra_m.max(0.0)
+            };
+            let ahead = leader.map(|(motion, kind)| (motion, gap_m(kind)));
+            let mut u = drive(car, to.link_speed_mps, ahead, own, k, dt_s);
+            if let Some(shields) = shields {
+                let partner = leader.map(|(motion, kind)| Partner {
+                    kind: DutyKind::RearEnd,
+                    at_m: 0.0,
+                    gap_m: gap_m(kind),
+                    braking_mps2: -self.kinds[usize::from(kind)].u_min_mps2,
+                    motion,
+                });
+                let shield = &shields[usize::from(car.kind)];
+                u = shield.project(car.x_m, car.v_mps, u, partner.into_iter()).u_mps2;
+            }
+            *held = Held::new(car.x_m, car.v_mps, u);
+            leader = Some((*held, car.kind));
+        }
+    }
+}
+
 /// The acceleration a vehicle on a link chooses: toward the link's speed, unless the sampled rear-end
 /// condition asks for less. `leader` is the motion of the vehicle ahead, in the link's coordinate, and the
 /// standstill gap to it, m.
-pub(super) fn drive(
+fn drive(
     car: &Car,
     link_speed_mps: f64,
     leader: Option<(Held, f64)>,

@@ -2,11 +2,13 @@
 
 mod car;
 mod change;
+mod command_fault;
 mod faults;
 mod gate;
 mod gateway;
 mod human;
 mod integrate;
+mod left;
 mod link;
 #[cfg(test)]
 mod merge_hashes;
@@ -19,7 +21,8 @@ mod traffic;
 mod way;
 
 pub use change::ChangeError;
-pub use gateway::{CommandFault, PutIn};
+pub use command_fault::CommandFault;
+pub use gateway::PutIn;
 pub use metrics::{CompletedVisit, FaultCounts, ShieldRow, ShieldSummary, WorldSummary, ZoneSummaryRow};
 pub use overlap::{FirstOverlap, OverlapSummary};
 pub use role::{CoordinatorMasks, Sheet, World};
