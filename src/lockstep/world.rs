@@ -1,20 +1,22 @@
 //! The world's side of a step: publish the state, collect the commands, integrate.
 
+mod judging;
+mod places;
+
 use super::kept::KeptStep;
-use super::members::check_sender;
 use super::refusals::Refusals;
 use super::{
-    Awaited, Feedbacks, Handover, Identity, Ledger, LockstepError, Observer, Progress, Refusal,
-    RefusedFrames, Seat, mask_of,
+    Awaited, Feedbacks, Identity, Ledger, LockstepError, Observer, Progress, Refusal, RefusedFrames, Seat,
+    mask_of,
 };
 use crate::scenario::ControllerNames;
 use crate::scenario::share::zones_of;
 use crate::step::{CommandPart, POLICY_NONE, StepFrames};
-use crate::transport::{Frame, Inbox, Loan, Outbox, Slots, TransportError};
+use crate::transport::{Inbox, Loan, Outbox, Slots, TransportError};
 use crate::world::{PutIn, Sheet, World};
 use ipc_schemas::{
-    Assignment, ExpectedHeader, FLAG_END_OF_RUN, FLAG_MISSED, Feedback, FrameHeader, Member, Role,
-    VehicleCommand, VehicleState, ZoneSummary,
+    Assignment, FLAG_END_OF_RUN, FLAG_MISSED, Feedback, FrameHeader, Role, VehicleCommand, VehicleState,
+    ZoneSummary,
 };
 
 /// The world's ends of the services.
@@ -85,9 +87,6 @@ struct Missing {
     commands: u64,
     coordination: u64,
 }
-
-/// Refused frames looked at in one go; after that whoever waits looks at its clock.
-const REFUSED_AT_ONCE: usize = 16;
 
 impl<S, C, M, A> WorldDriver<S, C, M, A>
 where
@@ -285,91 +284,6 @@ where
         self.refusals.late
     }
 
-    /// Gives a place to a process; frames its predecessor has left are refused from now on. Returns whether it
-    /// had not had it.
-    pub fn seat(&mut self, role: Role, index: u32, seat: Seat) -> bool {
-        if role == Role::Controller {
-            // Whoever comes back is waited for again.
-            self.abandoned &= !(1 << index);
-        }
-        let seats = if role == Role::Coordinator { &mut self.coordinators } else { &mut self.controllers };
-        let who = |seat: &Seat| (seat.generation, seat.process_id);
-        let place = seats.get_mut(index as usize).filter(|place| who(place) != who(&seat));
-        place.map(|place| *place = seat).is_some()
-    }
-
-    /// Who has which place, as everybody is to know.
-    pub fn members(&self) -> impl Iterator<Item = Member> {
-        let roles = [(Role::Coordinator, &self.coordinators), (Role::Controller, &self.controllers)];
-        roles.into_iter().flat_map(|(role, seats)| {
-            seats.iter().zip(0..).filter_map(move |(seat, index)| {
-                let (role, generation) = (role as u16, seat.generation);
-                Some(Member { process_id: seat.process_id?, generation, role, index })
-            })
-        })
-    }
-
-    /// Who is still there to receive states: role, index and process. After the end of the run the world must
-    /// not leave before them, for the last state would go with it.
-    pub fn receivers(&self) -> Vec<(Role, u32, u32)> {
-        let mut receivers = Vec::new();
-        let mut add = |role, seats: &[Seat], first: u32, process_id: Option<u32>| {
-            let is_there = |seat: &Seat| seat.process_id.is_some() && seat.process_id == process_id;
-            if let Some((_, index)) = seats.iter().zip(first..).find(|(seat, _)| is_there(seat)) {
-                receivers.extend(process_id.map(|id| (role, index, id)));
-            }
-        };
-        for (index, outbox) in (0..).zip(&self.ports.coordinator_states) {
-            let seats = &self.coordinators[index as usize..][..1];
-            outbox.receivers(&mut |process_id| add(Role::Coordinator, seats, index, process_id));
-        }
-        let seats = &self.controllers[..];
-        self.ports.state.receivers(&mut |process_id| add(Role::Controller, seats, 0, process_id));
-        receivers
-    }
-
-    /// Who is waited for and has sent something it should not have in this step: its name and the fault.
-    pub fn suspect(&self) -> Option<(String, &Refusal)> {
-        let (role, index, refusal) = self.suspect.as_ref()?;
-        let Phase::Collect(missing) = self.phase else { return None };
-        let mask = if *role == Role::Coordinator { missing.coordination } else { missing.commands };
-        let name = || match role {
-            Role::Controller => self.names().of(u32::from(*index)),
-            role => format!("{role} {index}"),
-        };
-        (mask >> index & 1 == 1).then(|| (name(), refusal))
-    }
-
-    /// What a process needs that takes a place now. `None` when that is not known yet (a controller must
-    /// wait for the coordination of the step), nothing is kept, or the run is over.
-    pub fn handover(&self, role: Role, index: u32) -> Option<Handover> {
-        let ledger = self.ledger.as_ref()?;
-        let mut handover = ledger.handover(role, index as usize);
-        handover.step = self.world.step();
-        match (self.phase, role) {
-            (Phase::Finished, _) => return None,
-            (Phase::Collect(missing), Role::Controller) if missing.coordination != 0 => return None,
-            (Phase::Collect(_), Role::Controller) => {
-                handover.header = Some(self.header);
-                handover.states = self.world.records().collect();
-            }
-            (Phase::Collect(_), Role::Coordinator) if self.header.coordinators_acting >> index & 1 == 1 => {
-                handover.header = Some(self.header);
-                handover.states = self.world.coordinator_records(index).collect();
-            }
-            _ => {}
-        }
-        match self.phase {
-            Phase::Collect(_) => {
-                handover.events = self.world.coordinators_with_events();
-                handover.summarised = self.header.coordinators_summarised;
-            }
-            // Those with an event in the step that has just ended.
-            _ => handover.summarised = self.world.coordinators_with_events(),
-        }
-        Some(handover)
-    }
-
     /// Does what can be done now.
     pub fn advance(&mut self) -> Result<Progress, LockstepError> {
         match self.phase {
@@ -512,148 +426,6 @@ where
         self.phase = Phase::Publish;
         Ok(())
     }
-
-    /// Takes a command frame; returns whether one was taken.
-    fn take_command(&mut self, missing: &mut Missing) -> Result<bool, LockstepError> {
-        for _ in 0..REFUSED_AT_ONCE {
-            let Some(frame) = self.ports.command.receive()? else { break };
-            let header = *frame.header();
-            match self.judge_command(&header, &frame, missing.commands) {
-                Ok(()) => {
-                    missing.commands &= !(1 << header.sender_index);
-                    if let Some(ledger) = &mut self.ledger {
-                        let index = usize::from(header.sender_index);
-                        ledger.command(index, &mut self.judged, self.controllers[index].stands_in);
-                    }
-                    return Ok(true);
-                }
-                Err(None) => self.refusals.late += 1,
-                Err(Some(refusal)) => {
-                    self.refuse(Role::Controller, &header, frame.origin(), refusal)?;
-                    self.detained.0.push(frame);
-                }
-            }
-        }
-        self.detained.0.clear();
-        Ok(false)
-    }
-
-    /// Judges a frame, of which the header has been copied already, and leaves its records in `judged`: they
-    /// stay in the memory of their sender, who may change them at any time. Otherwise why it is not taken, or
-    /// nothing for one that is merely late.
-    fn judge_command(
-        &mut self,
-        header: &FrameHeader,
-        frame: &M::Frame,
-        missing: u64,
-    ) -> Result<(), Option<Refusal>> {
-        let step = self.world.step();
-        let index = header.sender_index;
-        let seat = self.controllers.get_mut(usize::from(index));
-        let generation = seat.as_ref().map_or(0, |seat| seat.generation);
-        let expected =
-            ExpectedHeader { run_id: self.identity.run_id, role: Role::Controller, index, generation, step };
-        let records = frame.records();
-        let sent = (header, records.len(), frame.origin());
-        check_sender(&expected, sent, seat, missing, &self.ports.command)?;
-        copy_out(&mut self.judged, records);
-        let taken = self.world.command(u32::from(index), &self.judged);
-        taken.map_err(|fault| Some(Refusal::Command { step, fault }))
-    }
-
-    /// Takes a coordination frame; returns whether one was taken.
-    fn take_coordination(&mut self, missing: &mut Missing) -> Result<bool, LockstepError> {
-        for _ in 0..REFUSED_AT_ONCE {
-            let received = match &mut self.ports.coordination {
-                Some(inbox) => inbox.receive()?,
-                None => None,
-            };
-            let Some(frame) = received else { break };
-            let header = *frame.header();
-            match self.judge_coordination(&header, &frame, missing.coordination) {
-                Ok(()) => {
-                    missing.coordination &= !(1 << header.sender_index);
-                    if let Some(ledger) = &mut self.ledger {
-                        ledger.coordinate(header.sender_index, &self.judged_coordination);
-                        self.world.coordinate(&self.judged_coordination);
-                    }
-                    return Ok(true);
-                }
-                Err(None) => self.refusals.late += 1,
-                Err(Some(refusal)) => {
-                    self.refuse(Role::Coordinator, &header, frame.origin(), refusal)?;
-                    self.detained.1.push(frame);
-                }
-            }
-        }
-        self.detained.1.clear();
-        Ok(false)
-    }
-
-    /// The same for coordination.
-    fn judge_coordination(
-        &mut self,
-        header: &FrameHeader,
-        frame: &A::Frame,
-        missing: u64,
-    ) -> Result<(), Option<Refusal>> {
-        let step = self.world.step();
-        let index = header.sender_index;
-        let count = self.coordinators.len() as u32;
-        let seat = self.coordinators.get_mut(usize::from(index));
-        let generation = seat.as_ref().map_or(0, |seat| seat.generation);
-        let expected =
-            ExpectedHeader { run_id: self.identity.run_id, role: Role::Coordinator, index, generation, step };
-        let inbox = self.ports.coordination.as_ref().expect("the frame came from this inbox");
-        let records = frame.records();
-        check_sender(&expected, (header, records.len(), frame.origin()), seat, missing, inbox)?;
-        copy_out(&mut self.judged_coordination, records);
-        let own = zones_of(self.world.scenario().network.zones.len() as u32, u32::from(index), count);
-        match self.judged_coordination.iter().position(|a| !own.contains(&a.zone)) {
-            None => Ok(()),
-            Some(record) => {
-                let zone = self.judged_coordination[record].zone;
-                Err(Some(Refusal::ForeignZone { step, record, zone }))
-            }
-        }
-    }
-
-    fn refuse(
-        &mut self,
-        role: Role,
-        header: &FrameHeader,
-        origin: u128,
-        refusal: Refusal,
-    ) -> Result<(), LockstepError> {
-        let ports = &self.ports;
-        let process_id = self.refusals.enter(header, origin, refusal.clone(), || match role {
-            Role::Coordinator => ports.coordination.as_ref().and_then(|inbox| inbox.process_of(origin)),
-            _ => ports.command.process_of(origin),
-        });
-        // Whoever errs in its own name; strangers may claim what they like.
-        let seats = if role == Role::Coordinator { &self.coordinators } else { &self.controllers };
-        let own = seats.iter().zip(0..).find(|(seat, _)| seat.process_id == process_id);
-        if let Some((_, index)) = own {
-            self.tell_refusal(role, index, &refusal)?;
-            self.suspect = Some((role, index, refusal));
-        }
-        Ok(())
-    }
-
-    /// Tells a controller that its answer was not taken, once in a step: it may answer anew.
-    fn tell_refusal(&mut self, role: Role, index: u16, refusal: &Refusal) -> Result<(), LockstepError> {
-        let Some(feedbacks) = self.feedbacks.as_mut().filter(|_| role == Role::Controller) else {
-            return Ok(());
-        };
-        let step = self.world.step();
-        let known = self.refused_now.iter().any(|told| told.controller == index);
-        if let Some(told) = refusal.feedback(step, index).filter(|_| !known) {
-            self.refused_now.push(told);
-            let header = self.identity.header(step, self.world.time_ns());
-            feedbacks.tell(index, header, std::slice::from_ref(&told))?;
-        }
-        Ok(())
-    }
 }
 
 impl Sheet for Slots<'_, VehicleState> {
@@ -664,14 +436,4 @@ impl Sheet for Slots<'_, VehicleState> {
     fn written(&self) -> &[VehicleState] {
         self.written()
     }
-}
-
-/// Copies records out of a frame, reading each once. The copy grows by powers of two, so that it stops growing
-/// early on.
-fn copy_out<R: Copy>(copy: &mut Vec<R>, records: &[R]) {
-    copy.clear();
-    if copy.capacity() < records.len() {
-        copy.reserve(records.len().next_power_of_two());
-    }
-    copy.extend_from_slice(records);
 }
