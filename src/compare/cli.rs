@@ -30,10 +30,18 @@ pub struct CompareArgs {
     /// the network has merges only
     #[arg(long, value_name = "POLICY", conflicts_with = "table")]
     pub joint: Option<String>,
+    /// What it may cost, and where results go
+    #[command(flatten)]
+    pub lab: LabArgs,
+}
+
+/// What many runs may cost, and where their results go.
+#[derive(Clone, Debug, Args)]
+pub struct LabArgs {
     /// Keep results of runs in this directory, and take from it what is there
     #[arg(long, value_name = "DIR")]
     pub cache: Option<PathBuf>,
-    /// Write compare.json, compare.md and Pareto plots (SVG, PNG) into this directory
+    /// Write the results (JSON, Markdown) and figures (SVG, PNG) into this directory
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Write the JSON to standard output in place of the tables
@@ -42,6 +50,15 @@ pub struct CompareArgs {
     /// Threads; as many as there are cores by default. Results do not depend on it
     #[arg(long, value_name = "J")]
     pub jobs: Option<std::num::NonZeroUsize>,
+}
+
+impl LabArgs {
+    /// Threads and cache.
+    pub(super) fn means(&self) -> Result<Means, CompareError> {
+        let cores = std::thread::available_parallelism().map_or(1, usize::from);
+        let cache = self.cache.as_deref().map_or(Ok(Cache::none()), Cache::at)?;
+        Ok(Means { jobs: self.jobs.map_or(cores, usize::from), cache })
+    }
 }
 
 /// Seeds of the replicates.
@@ -94,9 +111,7 @@ pub fn bar() -> ProgressBar {
 
 /// Runs the command and returns what goes to standard output; a progress bar is on a terminal's standard error.
 pub fn main(args: &CompareArgs) -> Result<String, CompareError> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let cache = args.cache.as_deref().map_or(Ok(Cache::none()), Cache::at)?;
-    let means = Means { jobs: args.jobs.map_or(cores, usize::from), cache };
+    let means = args.lab.means()?;
     let comparisons = match &args.table {
         Some(name) => tables::comparisons(name, args.seeds),
         None => vec![Comparison {
@@ -118,8 +133,8 @@ pub fn main(args: &CompareArgs) -> Result<String, CompareError> {
     }
     bar.finish_and_clear();
     let report = Report { format: FORMAT, blocks };
-    if let Some(directory) = &args.out {
+    if let Some(directory) = &args.lab.out {
         report.write(directory)?;
     }
-    Ok(if args.json { report.json() } else { report.terminal() })
+    Ok(if args.lab.json { report.json() } else { report.terminal() })
 }

@@ -1,11 +1,11 @@
 //! `cz study`: mixed traffic over the share of automated vehicles, and over how far humans leave what is assumed of them.
 
 use super::cache::{Cache, bytes};
-use super::cli::{Seeds, bar};
+use super::cli::{LabArgs, Seeds, bar};
 use super::encounters::{Counts, Encounters};
 use super::measure::{Pool, Pooled, pool};
 use super::sample::{Observer, Sample, VehicleSample};
-use super::{CompareError, load};
+use super::{CompareError, Means, load};
 use crate::lockstep::LockstepError;
 use crate::lockstep::in_process::InProcess;
 use crate::reproduce::ReproduceError;
@@ -19,7 +19,7 @@ use plotters::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 /// What is studied.
@@ -39,18 +39,9 @@ pub struct StudyArgs {
     /// Seeds: how many, from 1, or a range; 4-13 by default, for which arrivals are random everywhere
     #[arg(long, value_name = "N|A-B")]
     pub seeds: Option<Seeds>,
-    /// Keep results of runs in this directory, and take from it what is there
-    #[arg(long, value_name = "DIR")]
-    pub cache: Option<PathBuf>,
-    /// Write the results (JSON, Markdown) and figures (SVG, PNG) into this directory
-    #[arg(long, value_name = "DIR")]
-    pub out: Option<PathBuf>,
-    /// Write the JSON to standard output in place of the tables
-    #[arg(long)]
-    pub json: bool,
-    /// Threads; as many as there are cores by default. Results do not depend on it
-    #[arg(long, value_name = "J")]
-    pub jobs: Option<std::num::NonZeroUsize>,
+    /// What it may cost, and where results go
+    #[command(flatten)]
+    pub lab: LabArgs,
 }
 
 /// A network with its demand, and how fast humans wish to drive there on average, m/s.
@@ -292,8 +283,7 @@ fn showed(scenario: &Arc<Scenario>, cache: &Cache, what: &str) -> Result<Showed,
 /// # Errors
 /// When a run, a figure or a file fails.
 pub fn main(args: &StudyArgs) -> Result<String, CompareError> {
-    let cores = std::thread::available_parallelism().map_or(1, usize::from);
-    let cache = args.cache.as_deref().map_or(Ok(Cache::none()), Cache::at)?;
+    let Means { jobs, cache } = args.lab.means()?;
     let seeds = args.seeds.unwrap_or(Seeds { from: 4, to: 13 }).all();
     let all = args.topic.series();
     let mut wanted = Vec::new();
@@ -312,7 +302,7 @@ pub fn main(args: &StudyArgs) -> Result<String, CompareError> {
             .map_err(|source| CompareError::Scenario { name: what.clone(), source: Box::new(source) })?;
         showed(&scenario, &cache, &what)
     };
-    parallel::each(args.jobs.map_or(cores, usize::from), &wanted, work, |key, result| {
+    parallel::each(jobs, &wanted, work, |key, result| {
         found.insert(*key, result);
         bar.inc(1);
     })?;
@@ -341,10 +331,10 @@ pub fn main(args: &StudyArgs) -> Result<String, CompareError> {
     };
     let json = serde_json::to_string_pretty(&study).expect("the study is numbers and words");
     let text = study.markdown();
-    if let Some(directory) = &args.out {
+    if let Some(directory) = &args.lab.out {
         study.write(directory, &json, &text)?;
     }
-    Ok(if args.json { json } else { text })
+    Ok(if args.lab.json { json } else { text })
 }
 
 impl Study {
