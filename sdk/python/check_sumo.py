@@ -126,6 +126,23 @@ def check_contract() -> None:
     print("cz world check: passed")
 
 
+def check_arrivals(folder: Path) -> None:
+    """A trace that comes with the program is made again, and what cannot be meant is refused in a line."""
+    out = folder / "arrivals.csv"
+
+    def arrivals(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "control_zones.sumo", "arrivals", "--out", str(out), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, timeout=100)
+
+    assert arrivals("--seed", "4", "--vehicles", "150").returncode == 0
+    kept = Path(__file__).resolve().parents[2] / "scenarios" / "data" / "sumo-400-4.csv"
+    assert out.read_bytes() == kept.read_bytes(), "not the trace that comes with the program"
+    for bad in (["--rate", "nan"], ["--rate", "9:1", "--rate", "5:1"], ["--road", "a<b"], ["--vehicles", "0"], ["--out", "/nowhere/a"]):
+        done = arrivals(*bad)
+        assert done.returncode == 2 and "Traceback" not in done.stderr, f"{bad}: {done.stderr}"
+    print("arrivals: a trace of the program's made again: passed")
+
+
 def main() -> None:
     """All of it, or why not."""
     try:
@@ -138,6 +155,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="cz-check-sumo-") as folder:
         check_networks(Path(folder))
         check_roundabout(Path(folder))
+        check_arrivals(Path(folder))
 
 
 if __name__ == "__main__":

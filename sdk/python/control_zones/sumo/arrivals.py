@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import typing
 
+import libsumo
+
 from .._session import Error
-from .periods import Period
+from .periods import WHOLE_S, Period, in_order
 from .simulation import program
 
 if typing.TYPE_CHECKING:
@@ -23,16 +26,24 @@ REST_M = 200.0
 
 def write(args: argparse.Namespace, folder: str) -> None:
     """Has SUMO drive and writes the trace."""
-    rows = trace(args.road or ["main1", "merge1", "merge2"], args.rate or [Period(2000.0, 400.0)], args.seed, folder)[: args.vehicles]
-    with open(args.out, "w", encoding="utf-8") as file:
-        file.write("time_s,road,speed_mps\n")
-        file.writelines(f"{time_s:.2f},{road},{speed_mps:.2f}\n" for time_s, road, speed_mps in rows)
+    roads: list[str] = args.road or ["main1", "merge1", "merge2"]
+    for road in roads:
+        if re.fullmatch(r"[\w-]+", road, re.ASCII) is None or roads.count(road) > 1:
+            raise Error(f"--road is {road!r}, expected a name of letters, digits, _ and -, each once")
+    if args.vehicles is not None and args.vehicles < 1:
+        raise Error(f"--vehicles is {args.vehicles}, expected 1 or more")
+    rates = in_order(args.rate or [Period(WHOLE_S, 400.0)])
+    try:
+        with open(args.out, "w", encoding="utf-8") as file:
+            file.write("time_s,road,speed_mps\n")
+            for time_s, road, speed_mps in trace(roads, rates, args.seed, folder)[: args.vehicles]:
+                file.write(f"{time_s:.2f},{road},{speed_mps:.2f}\n")
+    except OSError as error:
+        raise Error(f"--out {args.out}: {error.strerror}") from error
 
 
 def trace(roads: list[str], rates: list[Period], seed: int, folder: str) -> list[tuple[float, str, float]]:
     """Instants, roads and speeds of all that pass the ends of their roads, in order of time; the first comes at 0."""
-    import libsumo
-
     net, routes = _network(roads, folder), _routes(roads, rates, folder)
     options = ["--step-length", "0.1", "--seed", str(seed), "--no-step-log", "--no-warnings", "--time-to-teleport", "-1"]
     libsumo.start(["sumo", "-n", net, "-r", routes, *options])

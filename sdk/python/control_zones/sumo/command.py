@@ -87,6 +87,9 @@ def command(given: Sequence[str]) -> int:
         at = own.index("world", 1)
         own, behind = own[:at], own[at:]
     args = parser.parse_args(own)
+    # Says what is missing where SUMO is not installed.
+    from . import simulation as _
+
     if args.command == "import":
         from .importing import write
 
