@@ -500,3 +500,24 @@ fn what_does_not_exist_is_found() {
     assert!(is_code("LeftCar") && is_code("leave_zone") && is_code("STATE_LEFT"));
     assert!(!is_code("World") && !is_code("u_") && !is_code("XXH3"));
 }
+
+/// What is left out of the tests stands in CONTRIBUTING.md, by the name of its file.
+#[test]
+fn tests_that_are_run_by_hand_are_named() {
+    let contributing = std::fs::read_to_string(root().join("CONTRIBUTING.md")).unwrap();
+    let mut seen = 0;
+    for folder in ["tests", "view/tests"] {
+        for file in
+            files(&root().join(folder)).iter().filter(|file| file.extension().is_some_and(|e| e == "rs"))
+        {
+            let left_out = std::fs::read_to_string(file).unwrap().matches("\n#[ignore").count();
+            // Of a folder of files one is the test's.
+            let own = file.parent().filter(|parent| parent.join("main.rs").exists()).unwrap_or(file);
+            let name = own.file_stem().unwrap().to_str().unwrap();
+            let named = contributing.matches(&format!("`{name}`")).count();
+            assert!(left_out == 0 || named > 0, "{}: CONTRIBUTING.md names no `{name}`", file.display());
+            seen += left_out;
+        }
+    }
+    assert!(seen >= 10, "{seen}: this looks for something else than there is");
+}

@@ -39,8 +39,12 @@ const TRACES: [(&str, &str); 66] = traces![
 ];
 
 /// The names, as users read them.
-pub(super) const TRACE_NAMES: &str =
-    "`sumo-400-1` to `-23`, `sumo-600-4` to `-23`, `sumo-varying-1` to `-23`";
+macro_rules! trace_names {
+    () => {
+        "sumo-400-1 to -23, sumo-600-4 to -23, sumo-varying-1 to -23"
+    };
+}
+pub(super) use trace_names;
 
 /// Text of an embedded trace.
 pub(super) fn trace(name: &str) -> Option<&'static str> {

@@ -9,6 +9,7 @@ mod kinds;
 pub use document::document;
 pub(in crate::scenario) use kinds::{Choice, Flag, Key, Number, other};
 
+use super::embedded::trace_names;
 use super::ranges;
 use super::{
     EntryRule, FeConditions, LawKind, PassingOrder, PositionFeedback, ReferenceLaw, Replan, SafetyRows,
@@ -379,10 +380,13 @@ pub(in crate::scenario) static TRACE: Keys = &[
         "trace",
         "text",
         "this or `rates` is required",
-        "one of the traces that come with the program (`sumo-400-1` to `-23`, `sumo-600-4` to `-23`, `sumo-varying-1` to \
-         `-23`), or a CSV file with the header `time_s,road,speed_mps`, and `route` as a fourth column if some rows name one of the road's, \
-         rows in order of time; a road takes its own rows. Relative to the scenario file. `{seed}` in it is replaced by \
-         the seed",
+        concat!(
+            "one of the traces that come with the program (",
+            trace_names!(),
+            "), or a CSV file with the header `time_s,road,speed_mps`, and `route` as a fourth column if some rows name one \
+             of the road's, rows in order of time; a road takes its own rows. Relative to the scenario file. `{seed}` in it \
+             is replaced by the seed"
+        ),
     ),
     &other(
         "trace_seeds",

@@ -171,7 +171,7 @@ impl DemandReader<'_> {
                 }
                 if matches!(self.base, TraceBase::Embedded) {
                     expected += ": a file, or one of the embedded ";
-                    expected += &crate::scenario::embedded::TRACE_NAMES.replace('`', "");
+                    expected += crate::scenario::embedded::trace_names!();
                 }
                 Err(field.bad_because(Some(problem), &expected))
             }
