@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import typing
 
 import libsumo
 
 from .._session import Error
 from .periods import WHOLE_S, Period, in_order
-from .simulation import program
+from .simulation import make
 
 if typing.TYPE_CHECKING:
     import argparse
@@ -77,10 +76,7 @@ def _network(roads: list[str], folder: str) -> str:
         files.append(os.path.join(folder, f"roads.{kind}.xml"))
         _write(files[-1], lines)
     net = os.path.join(folder, "roads.net.xml")
-    command = [program("netconvert"), "-n", files[0], "-e", files[1], "-o", net]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise Error(f"netconvert: {(done.stderr or done.stdout).strip()}")
+    make("netconvert", "-n", files[0], "-e", files[1], "-o", net)
     return net
 
 

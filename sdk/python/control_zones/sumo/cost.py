@@ -12,7 +12,7 @@ import tempfile
 import typing
 
 from .._session import Error
-from .simulation import program, read_net
+from .simulation import make, read_net
 
 if typing.TYPE_CHECKING:
     import argparse
@@ -31,14 +31,12 @@ def junctions_a_side(vehicles: int) -> int:
     return side
 
 
-def make(vehicles: int, folder: str, seed: int) -> str:
+def grid(vehicles: int, folder: str, seed: int) -> str:
     """A grid and vehicles that wander about in it until the run ends; returns the configuration."""
     base = os.path.join(folder, f"grid{vehicles}")
     side = junctions_a_side(vehicles)
-    grid = [program("netgenerate"), "--grid", "--grid.number", str(side), "--grid.length", repr(BLOCK_M), "--no-turnarounds", "true"]
-    done = subprocess.run([*grid, "-o", f"{base}.net.xml"], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        raise Error(f"netgenerate: {(done.stderr or done.stdout).strip()}")
+    options = ["--grid", "--grid.number", str(side), "--grid.length", repr(BLOCK_M), "--no-turnarounds", "true"]
+    make("netgenerate", *options, "-o", f"{base}.net.xml")
     edges = [edge for edge in read_net(f"{base}.net.xml").getEdges() if not edge.getFunction()]
     onward = {str(edge.getID()): sorted(str(other.getID()) for other in edge.getOutgoing()) for edge in edges}
     chance = random.Random(seed)
@@ -78,7 +76,7 @@ def measure(vehicles: int, cz: str | None, seed: int) -> Share:
     """Runs the grid in this process, and in several where `cz` names the program that starts them."""
     with tempfile.TemporaryDirectory(prefix=f"cz-sumo-cost-{os.getpid()}-") as folder:
         # While they come there are fewer.
-        config = make(round(vehicles / (1.0 - 0.5 * COME_S / END_S)), folder, seed)
+        config = grid(round(vehicles / (1.0 - 0.5 * COME_S / END_S)), folder, seed)
         scenario, summary = os.path.join(folder, "grid.toml"), os.path.join(folder, "summary.json")
         own = [sys.executable, "-m", "control_zones.sumo", "run", config, "--seed", str(seed)]
         # Of several runs the least disturbed.

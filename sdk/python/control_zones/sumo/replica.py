@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 import os
-import subprocess
 import typing
 import xml.etree.ElementTree as ElementTree
 
 import libsumo
 
-from .._session import Error
 from ..world import GONE, Admitted, Newcomer, Traffic
 from .network import Place, cut
-from .simulation import Car, Simulation, is_automated, program
+from .simulation import Car, Simulation, is_automated, make
 
 if typing.TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -144,12 +142,10 @@ class Replica:
         for name, lines_ in (("nod", [*nodes, "</nodes>"]), ("edg", [*edges, "</edges>"]), ("con", [*connections, "</connections>"])):
             with open(f"{base}.{name}.xml", "w") as file:
                 file.write("\n".join(lines_) + "\n")
-        command = [program("netconvert"), "-n", f"{base}.nod.xml", "-e", f"{base}.edg.xml", "-x", f"{base}.con.xml"]
-        command += ["-o", f"{base}.net.xml", "--no-turnarounds", "true", "--no-warnings", "true", "--precision", "6"]
-        command += ["--tls.default-type", "actuated", "--offset.disable-normalization", "true"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        if done.returncode != 0:
-            raise Error(f"netconvert: {(done.stderr or done.stdout).strip()}")
+        options = ["--no-turnarounds", "true", "--no-warnings", "true", "--precision", "6"]
+        options += ["--tls.default-type", "actuated", "--offset.disable-normalization", "true"]
+        given = ["-n", f"{base}.nod.xml", "-e", f"{base}.edg.xml", "-x", f"{base}.con.xml"]
+        make("netconvert", *given, "-o", f"{base}.net.xml", *options)
         draw(f"{base}.net.xml", roads, ways)
         return f"{base}.net.xml"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import subprocess
 import time
 import typing
 from dataclasses import dataclass, field
@@ -183,6 +184,13 @@ def sumolib_home() -> str:
 def program(name: str) -> str:
     """The path of one of SUMO's programs."""
     return os.path.join(sumolib_home(), "bin", name)
+
+
+def make(name: str, *arguments: str) -> None:
+    """Has one of SUMO's programs make files."""
+    done = subprocess.run([program(name), *arguments], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise Error(f"{name}: {(done.stderr or done.stdout).strip()}")
 
 
 def is_automated(seed: int, vehicle: str | int, share: float) -> bool:
