@@ -1,6 +1,6 @@
 //! A rigorous bound that knows of merging, whatever the passing order.
 //!
-//! Vehicles are left alone but for disjoint pairs, and [triples], of vehicles that pass one merge: one passes it after the
+//! Vehicles are left alone but for disjoint pairs, and `triples`, of vehicles that pass one merge: one passes it after the
 //! other, and then finds it at least `phi v + delta` further. A pair costs at least the lesser of its two orders, where both
 //! came by the same lanes that in which they came, and an order at least as much as its Lagrangian dual for any multiplier
 //! `mu >= 0` of `t_second(merge) >= t_first(merge + phi v + delta)`: with the second's speed `v` at the merge given, that
