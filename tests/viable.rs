@@ -288,11 +288,11 @@ fn every_row_has_its_verdict() {
     };
     let ahead =
         |x: f64, v: f64| Partner { conflict_m: LENGTH_M, ..Partner::unplanned(DutyKind::RearEnd, x, v, 0.0) };
-    assert_eq!(verdict(&at(0.0, 0.0, 16.0), ahead(190.0, 20.0)), Verdict::Nominal);
-    assert_eq!(verdict(&at(0.0, 100.0, 10.0), ahead(117.0, 9.0)), Verdict::Bound(Row::Comfort));
+    assert_eq!(verdict(&at(0.0, 0.0, 16.0), ahead(190.0, 20.0)), Verdict::Tracked(None));
+    assert_eq!(verdict(&at(0.0, 100.0, 10.0), ahead(117.0, 9.0)), Verdict::Tracked(Some(Row::Comfort)));
     assert_eq!(verdict(&at(0.0, 100.0, 10.0), ahead(103.0, 0.0)), Verdict::Infeasible);
     let fast = Situation { terminal: Terminal::Speed(60.0), ..at(0.0, 100.0, 29.9) };
-    assert_eq!(verdict(&fast, ahead(400.0, 30.0)), Verdict::Bound(Row::VMax));
+    assert_eq!(verdict(&fast, ahead(400.0, 30.0)), Verdict::Tracked(Some(Row::VMax)));
 }
 
 /// A run in one process.

@@ -2,6 +2,7 @@
 
 use super::geometry::{Conflicts, PointKind};
 use crate::scenario::VehicleParams;
+use std::hint::select_unpredictable;
 
 /// What a vehicle owes to another.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -46,14 +47,13 @@ impl Duty {
     /// is the leader; a crossing is over once the vehicle has reached it.
     #[inline(always)]
     pub fn in_force(&self, x_m: f64, partner_x_m: f64) -> Option<DutyKind> {
-        if partner_x_m >= self.until_m {
-            return None;
-        }
-        match self.kind {
-            DutyKind::Merge if x_m >= self.own_m => Some(DutyKind::RearEnd),
-            DutyKind::Cross if x_m >= self.own_m => None,
-            kind => Some(kind),
-        }
+        // Of what kind the next duty is, is not to be foretold, and mostly all are in force: one branch, and that on the
+        // whole.
+        let has_reached = x_m >= self.own_m;
+        let is_over = (partner_x_m >= self.until_m) | (has_reached & (self.kind == DutyKind::Cross));
+        let kind =
+            select_unpredictable(has_reached & (self.kind == DutyKind::Merge), DutyKind::RearEnd, self.kind);
+        (!is_over).then_some(kind)
     }
 
     /// Added to the partner's position to express it in the vehicle's coordinate, m.

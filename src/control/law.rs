@@ -95,12 +95,10 @@ pub struct Situation {
 /// Why the command is what it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Verdict {
-    /// The reference is tracked as wished.
-    Nominal,
+    /// The reference is tracked: as wished, or as far as this row allows.
+    Tracked(Option<Row>),
     /// FE mode brakes.
     Fe,
-    /// A row decides.
-    Bound(Row),
     /// No acceleration satisfies all rows; `u_min` is commanded.
     Infeasible,
 }

@@ -67,14 +67,7 @@ impl Memory {
     /// From words; anything that is no plan is none.
     #[inline(always)]
     pub fn recall(words: &Words) -> Memory {
-        let [start_s, origin_m, v0_mps, a, b, duration_s, terminal_mps, _] = words.words;
-        let plan = (duration_s > 0.0).then_some(Reference {
-            start_s,
-            origin_m,
-            v0_mps,
-            optimum: Optimum { a, b, duration_s },
-            terminal: if terminal_mps < 0.0 { Terminal::Free } else { Terminal::Speed(terminal_mps) },
-        });
+        let plan = (words.words[DURATION] > 0.0).then(|| plan_of(words));
         Memory { mode: if words.mode == MODE_OCBF { Mode::Ocbf } else { Mode::Fe }, plan }
     }
 
@@ -86,19 +79,44 @@ impl Memory {
         };
         let Some(plan) = &self.plan else { return Words { mode, ..Words::ENTERED } };
         let Optimum { a, b, duration_s } = plan.optimum;
-        let terminal_mps = match plan.terminal {
-            Terminal::Free => -1.0,
-            Terminal::Speed(w) => w,
-        };
-        let words = [plan.start_s, plan.origin_m, plan.v0_mps, a, b, duration_s, terminal_mps, 0.0];
-        Words { mode, words }
+        let terminal = terminal_word(plan.terminal);
+        Words { mode, words: [plan.start_s, plan.origin_m, plan.v0_mps, a, b, duration_s, terminal, 0.0] }
     }
+}
 
-    /// The plan that is tracked in this step; `None` in FE mode, or when it is to be made first.
-    #[inline(always)]
-    fn plan_for(&self, s: &Situation) -> Option<Reference> {
-        self.plan.filter(|plan| self.mode == Mode::Ocbf && plan.terminal == s.terminal)
+/// Where a plan's duration stands among the words, s.
+const DURATION: usize = 5;
+/// Where its terminal condition stands.
+const TERMINAL: usize = 6;
+
+/// A terminal condition as a word: a speed, m/s, or less than any.
+#[inline(always)]
+fn terminal_word(terminal: Terminal) -> f64 {
+    match terminal {
+        Terminal::Free => -1.0,
+        Terminal::Speed(w) => w,
     }
+}
+
+/// The plan in words that hold one.
+#[inline(always)]
+fn plan_of(words: &Words) -> Reference {
+    let [start_s, origin_m, v0_mps, a, b, duration_s, terminal_mps, _] = words.words;
+    Reference {
+        start_s,
+        origin_m,
+        v0_mps,
+        optimum: Optimum { a, b, duration_s },
+        terminal: if terminal_mps < 0.0 { Terminal::Free } else { Terminal::Speed(terminal_mps) },
+    }
+}
+
+/// Whether the words hold a plan that is tracked in this step: not in FE mode, and not when it is to be made first.
+#[inline(always)]
+fn is_tracked(words: &Words, s: &Situation) -> bool {
+    words.mode == MODE_OCBF
+        && words.words[DURATION] > 0.0
+        && words.words[TERMINAL] == terminal_word(s.terminal)
 }
 
 impl Law for Ocbf {
@@ -109,31 +127,35 @@ impl Law for Ocbf {
     where
         P: Iterator<Item = Partner> + Clone,
     {
-        let mut memory = Memory::recall(words);
-        if memory.plan_for(s).is_none() {
-            memory = self.renew(s, partners.clone(), memory);
-            *words = memory.words();
-        }
         let vehicle = self.vehicle(s);
-        let brakes = |verdict| Decision { u_mps2: vehicle.u_min_mps2, verdict, exit: memory.exit() };
-        let Some(plan) = memory.plan_for(s) else { return brakes(Verdict::Fe) };
+        let brakes = |verdict, exit| Decision { u_mps2: vehicle.u_min_mps2, verdict, exit };
+        if !is_tracked(words, s) {
+            // Copies: what is handed over in memory would have to lie there for every other vehicle, too.
+            let (s, partners) = (*s, partners.clone());
+            if !self.remember(&s, partners, words) {
+                return brakes(Verdict::Fe, Memory::recall(words).exit());
+            }
+        }
+        let plan = plan_of(words);
+        let exit = (plan.exit_time_s(), plan.exit_speed_mps());
         let Program { tracking, interval } = self.program(s, partners.clone(), &plan);
         let u = match self.control.solver {
             Solver::ClosedForm => qp::solve(&tracking, &interval),
             Solver::Clarabel => {
                 // The limits once more, so that an answer within the solver's tolerance obeys them.
-                clarabel::solve(&tracking, &self.row_list(s, partners))
+                let (s, partners) = (*s, partners.clone());
+                clarabel::solve(&tracking, &self.row_list(&s, partners))
                     .map(|u| u.clamp(vehicle.u_min_mps2, vehicle.u_max_mps2))
             }
         };
         match u {
-            None => brakes(Verdict::Infeasible),
+            None => brakes(Verdict::Infeasible, exit),
             Some(u) => {
                 let wish = tracking.free_minimum_mps2();
                 let (above, below) = (wish > interval.high, wish < interval.low);
                 let row = select_unpredictable(above, interval.high_row, interval.low_row);
-                let verdict = select_unpredictable(above || below, Verdict::Bound(row), Verdict::Nominal);
-                Decision { u_mps2: u, verdict, exit: memory.exit() }
+                let row = select_unpredictable(above || below, Some(row), None);
+                Decision { u_mps2: u, verdict: Verdict::Tracked(row), exit }
             }
         }
     }
@@ -157,10 +179,16 @@ impl Ocbf {
         &self.kinds[usize::from(s.kind)]
     }
 
-    /// What a vehicle remembers that is still, or just now, in FE mode, or whose terminal condition changed.
+    /// Renews what a vehicle remembers, and says whether it has a plan now that is tracked.
     // Out of line: most vehicles in most steps track the plan they have.
     #[cold]
     #[inline(never)]
+    fn remember<P: Iterator<Item = Partner>>(&self, s: &Situation, partners: P, words: &mut Words) -> bool {
+        *words = self.renew(s, partners, Memory::recall(words)).words();
+        is_tracked(words, s)
+    }
+
+    /// What a vehicle remembers that is still, or just now, in FE mode, or whose terminal condition changed.
     pub fn renew<P>(&self, s: &Situation, partners: P, memory: Memory) -> Memory
     where
         P: Iterator<Item = Partner>,
@@ -207,10 +235,9 @@ impl Ocbf {
     where
         P: Iterator<Item = Partner> + Clone,
     {
-        let memory = Memory::recall(words);
-        let current = memory.plan_for(s).is_some();
-        let memory = if current { memory } else { self.renew(s, partners.clone(), memory) };
-        let plan = memory.plan_for(s)?;
+        let mut words = *words;
+        let is_tracked = is_tracked(&words, s) || self.remember(s, partners.clone(), &mut words);
+        let plan = is_tracked.then(|| plan_of(&words))?;
         Some((self.program(s, partners.clone(), &plan), self.row_list(s, partners)))
     }
 

@@ -13,6 +13,7 @@ use crate::scenario::{Scenario, ZoneId};
 use crate::vehicle::Inequality;
 use assigned::{Member, Renewed};
 use ipc_schemas::{self as frames, Assignment, VehicleCommand, VehicleState};
+use std::hint::select_unpredictable;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -389,9 +390,12 @@ fn first_of(states: &[VehicleState], zone: ZoneId, expected: usize) -> usize {
 #[inline(always)]
 fn command(state: &VehicleState, decision: &Decision, memory: &Words) -> VehicleCommand {
     let (verdict, binding_rows) = match decision.verdict {
-        Verdict::Nominal => (frames::VERDICT_NOMINAL, 0),
+        Verdict::Tracked(row) => {
+            let rows = row.map_or(0, |row| row as u32);
+            // Whether a row binds is not to be foretold: no branch.
+            (select_unpredictable(rows != 0, frames::VERDICT_BOUND, frames::VERDICT_NOMINAL), rows)
+        }
         Verdict::Fe => (frames::VERDICT_FE, 0),
-        Verdict::Bound(row) => (frames::VERDICT_BOUND, row as u32),
         Verdict::Infeasible => (frames::VERDICT_INFEASIBLE, 0),
     };
     let command = VehicleCommand {

@@ -94,7 +94,7 @@ impl Law for Viable {
         }
         let (above, below) = (plan.u_mps2 > interval.high, plan.u_mps2 < interval.low);
         let row = if above { interval.high_row } else { interval.low_row };
-        let verdict = if above || below { Verdict::Bound(row) } else { Verdict::Nominal };
+        let verdict = Verdict::Tracked((above || below).then_some(row));
         // The greatest viable acceleration outranks the least speed.
         let u_mps2 = plan.u_mps2.max(interval.low).min(interval.high);
         Decision { u_mps2, verdict, exit }

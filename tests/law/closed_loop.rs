@@ -51,7 +51,7 @@ fn chase(scenario: &Scenario, v: f64, gap: f64, leader_v: f64, leader_us: &[f64]
         let d = law.decide(&s, std::iter::once(p), &mut memory);
         seen.infeasible += u32::from(d.verdict == Verdict::Infeasible);
         seen.bound_steps +=
-            u32::from(matches!(d.verdict, Verdict::Bound(Row::RearEnd | Row::RearEndFeasibility)));
+            u32::from(matches!(d.verdict, Verdict::Tracked(Some(Row::RearEnd | Row::RearEndFeasibility))));
         let wanted = leader_us[(k / hold) % leader_us.len()];
         // The leader keeps to its speed limits.
         let u = if p.v_mps + wanted * dt > 30.0 { 0.0 } else { wanted };

@@ -195,7 +195,7 @@ fn fe_mode_ends_beyond_its_part_of_the_approach() {
 fn a_vehicle_alone_never_enters_fe_mode() {
     let mut memory = Memory::ENTERED;
     let d = decide(&scenario(), &at(0.0, 0.0, 15.0), &[], &mut memory);
-    assert_eq!((d.verdict, memory.mode), (Verdict::Nominal, Mode::Ocbf));
+    assert_eq!((d.verdict, memory.mode), (Verdict::Tracked(None), Mode::Ocbf));
 }
 
 /// What keeps the vehicle in FE mode is what the scenario asks for. (A row at `u_min` is the reserve plus k
@@ -247,13 +247,13 @@ fn verdict_names_the_row_that_decides() {
     };
     let no_clf = with(|c| c.clf = false);
     let table: [(&str, Situation, Vec<Partner>, Verdict); 8] = [
-        ("free", s, vec![], Verdict::Nominal),
-        ("far ahead", s, vec![ahead(300.0, 15.0, 0.0)], Verdict::Nominal),
-        ("close ahead", s, vec![ahead(55.0, 15.0, 0.0)], Verdict::Bound(Row::RearEnd)),
-        ("braking ahead", s, vec![ahead(90.0, 9.0, -4.0)], Verdict::Bound(Row::RearEndFeasibility)),
-        ("braking merger", s, vec![merging(60.0, 13.0, -2.0)], Verdict::Bound(Row::MergeFeasibility)),
-        ("v_max", fast, vec![], Verdict::Bound(Row::VMax)),
-        ("v_min", crawling, vec![], Verdict::Bound(Row::VMin)),
+        ("free", s, vec![], Verdict::Tracked(None)),
+        ("far ahead", s, vec![ahead(300.0, 15.0, 0.0)], Verdict::Tracked(None)),
+        ("close ahead", s, vec![ahead(55.0, 15.0, 0.0)], Verdict::Tracked(Some(Row::RearEnd))),
+        ("braking ahead", s, vec![ahead(90.0, 9.0, -4.0)], Verdict::Tracked(Some(Row::RearEndFeasibility))),
+        ("braking merger", s, vec![merging(60.0, 13.0, -2.0)], Verdict::Tracked(Some(Row::MergeFeasibility))),
+        ("v_max", fast, vec![], Verdict::Tracked(Some(Row::VMax))),
+        ("v_min", crawling, vec![], Verdict::Tracked(Some(Row::VMin))),
         ("too late", s, vec![ahead(35.0, 5.0, -4.0)], Verdict::Infeasible),
     ];
     for (name, s, partners, verdict) in table {
@@ -262,20 +262,20 @@ fn verdict_names_the_row_that_decides() {
         let i = permitted(&no_clf, &s, &partners);
         match verdict {
             Verdict::Infeasible => assert_eq!(d.u_mps2, -4.0),
-            Verdict::Bound(Row::VMin) => assert!(close(d.u_mps2, i.low)),
-            Verdict::Bound(_) => assert!(close(d.u_mps2, i.high)),
+            Verdict::Tracked(Some(Row::VMin)) => assert!(close(d.u_mps2, i.low)),
+            Verdict::Tracked(Some(_)) => assert!(close(d.u_mps2, i.high)),
             _ => assert!(d.u_mps2 > i.low && d.u_mps2 < i.high),
         }
     }
     let lonely = with(|c| c.feasibility_rows = false);
     let d = fresh(&lonely, &at(9.0, 150.0, 15.0), &[merging(171.5, 15.0, 0.0)]);
-    assert_eq!(d.verdict, Verdict::Bound(Row::Merge));
+    assert_eq!(d.verdict, Verdict::Tracked(Some(Row::Merge)));
     // A plan that asks for more than the vehicle can: from 0 to 200 m at a high price of time.
     let hurried = Scenario { beta: 50.0, ..no_clf };
-    assert_eq!(fresh(&hurried, &at(0.0, 0.0, 5.0), &[]).verdict, Verdict::Bound(Row::UMax));
+    assert_eq!(fresh(&hurried, &at(0.0, 0.0, 5.0), &[]).verdict, Verdict::Tracked(Some(Row::UMax)));
     let to_rest = Situation { length_m: 30.0, terminal: Terminal::Speed(0.0), ..at(0.0, 0.0, 20.0) };
     let d = fresh(&Scenario { beta: 4.0, ..hurried }, &to_rest, &[]);
-    assert_eq!((d.u_mps2, d.verdict), (-4.0, Verdict::Bound(Row::UMin)));
+    assert_eq!((d.u_mps2, d.verdict), (-4.0, Verdict::Tracked(Some(Row::UMin))));
 }
 
 // --- switches ---
@@ -396,7 +396,7 @@ fn rows_follow_the_switches() {
             let (d, i) = (fresh(&scenario, &s, &[partner]), permitted(&scenario, &s, &[partner]));
             assert!(!i.is_empty() && d.u_mps2 <= i.high, "{name}: {d:?} {i:?}");
             match d.verdict {
-                Verdict::Bound(row) => {
+                Verdict::Tracked(Some(row)) => {
                     assert!(row == i.high_row && close(d.u_mps2, i.high), "{name}: {d:?} {i:?}")
                 }
                 _ => assert_eq!(name, "feasibility_rows", "{d:?} {i:?}"),
@@ -489,8 +489,8 @@ proptest! {
         match d.verdict {
             Verdict::Infeasible => prop_assert_eq!(d.u_mps2, -4.0),
             // One row may set the end to within rounding of another: the value counts.
-            Verdict::Bound(_) => prop_assert!(close(d.u_mps2, i.high) || close(d.u_mps2, i.low), "{d:?} {i:?}"),
-            Verdict::Nominal => prop_assert!(d.u_mps2 > i.low - 1e-9 && d.u_mps2 < i.high + 1e-9),
+            Verdict::Tracked(Some(_)) => prop_assert!(close(d.u_mps2, i.high) || close(d.u_mps2, i.low), "{d:?} {i:?}"),
+            Verdict::Tracked(None) => prop_assert!(d.u_mps2 > i.low - 1e-9 && d.u_mps2 < i.high + 1e-9),
             Verdict::Fe => prop_assert!(false, "FE in OCBF mode"),
         }
     }
