@@ -8,7 +8,7 @@ use control_zones::lockstep::LockstepError;
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{Override, Scenario, load};
 use control_zones::world::{AdvanceError, Coming, Done, Newcomer, Task, Traffic, TrafficError, WorldSummary};
-use ipc_schemas::VehicleState;
+use ipc_schemas::{STATE_WAITS, VehicleState};
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -141,6 +141,37 @@ fn who_is_brought_in_and_taken_out_anywhere_is_reckoned_with() {
     let traffic = summary.traffic.unwrap();
     assert_eq!((summary.arrived, summary.departed, traffic.gone, traffic.uncommanded), (4, 3, 1, 1));
     assert_eq!(summary.overlaps.pairs, 0);
+}
+
+/// A human who stands before a merge, perhaps to let others go, holds nobody up for ever: automated vehicles on the other road pass
+/// before it, and who is behind it on its lane stays there.
+#[test]
+fn who_stands_and_waits_is_not_waited_for() {
+    let scenario = scenario("two-merges", &["end.time_s=100", "shield=on"]);
+    let traffic = Scripted {
+        coming: vec![
+            (0, newcomer(1, 150.0, 0.0, 0)),
+            (0, newcomer(1, 100.0, 0.0, 1)),
+            (1, newcomer(0, 0.0, 13.0, 1)),
+            (60, newcomer(0, 0.0, 13.0, 1)),
+        ],
+        ..Scripted::default()
+    };
+    let mut run = InProcess::played(&scenario, 1, 1, Box::new(traffic), false);
+    let (mut first_waits, mut waited) = (None, 0);
+    while run.step().unwrap() {
+        for state in run.world().records().filter(|state| state.flags & STATE_WAITS != 0) {
+            assert_eq!((state.vehicle, state.v_mps), (0, 0.0));
+            first_waits = first_waits.or(Some(run.world().step()));
+            waited += 1;
+        }
+    }
+    let summary = run.world().summary();
+    // It has stood for 2 s then, and does not cease to.
+    assert_eq!(first_waits, Some(21));
+    assert!(waited > 900, "{waited}");
+    assert_eq!((summary.arrived, summary.departed, summary.overlaps.pairs), (4, 2, 0));
+    assert_eq!(summary.zones[0].orders_refused, 0);
 }
 
 /// What a traffic says is checked, and what is wrong with it said in a line.

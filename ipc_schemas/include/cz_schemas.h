@@ -64,8 +64,12 @@
 /** `cz_vehicle_state_t.flags`: driven by a human. Not to be commanded, and without a plan. */
 #define CZ_STATE_HUMAN UINT16_C(8)
 /** `cz_vehicle_state_t.flags`: a human who does not follow the passing order passed a conflict
- *  point during the step just ended (an event of the zone). */
+ *  point, or came to wait, still waits after a while, or waits no more, during the step just ended
+ *  (an event of the zone). */
 #define CZ_STATE_PASSED UINT16_C(16)
+/** `cz_vehicle_state_t.flags`: a human who does not follow the passing order waits: it has stood
+ *  for some time with a conflict point ahead, or is behind one on its lane that has. */
+#define CZ_STATE_WAITS UINT16_C(32)
 
 /** `cz_assignment_t.kind`: no partner; the record only carries the terminal speed. */
 #define CZ_CONSTRAINT_NONE UINT16_C(0)
@@ -369,7 +373,7 @@ typedef struct cz_vehicle_state {
     /** Kind of vehicle: index in the scenario's fleet. */
     uint16_t kind;
     /** Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3 human
-     *  driver, bit 4 a human passed a conflict point. */
+     *  driver, bit 4 a human passed a conflict point, or came to wait or to go on, bit 5 it waits. */
     uint16_t flags;
 } cz_vehicle_state_t;
 CZ_ASSERT_(vehicle_state_size, sizeof(cz_vehicle_state_t) == 96);

@@ -49,9 +49,13 @@ STATE_LEFT = 2
 STATE_LEFT_NOW = 4
 #: `VehicleState.flags`: driven by a human. Not to be commanded, and without a plan.
 STATE_HUMAN = 8
-#: `VehicleState.flags`: a human who does not follow the passing order passed a conflict point
-#: during the step just ended (an event of the zone).
+#: `VehicleState.flags`: a human who does not follow the passing order passed a conflict point, or
+#: came to wait, still waits after a while, or waits no more, during the step just ended (an event
+#: of the zone).
 STATE_PASSED = 16
+#: `VehicleState.flags`: a human who does not follow the passing order waits: it has stood for some
+#: time with a conflict point ahead, or is behind one on its lane that has.
+STATE_WAITS = 32
 
 #: `Assignment.kind`: no partner; the record only carries the terminal speed.
 CONSTRAINT_NONE = 0
@@ -333,7 +337,8 @@ class VehicleState(ctypes.Structure):
             begin at.
         kind: Kind of vehicle: index in the scenario's fleet.
         flags: Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3
-            human driver, bit 4 a human passed a conflict point.
+            human driver, bit 4 a human passed a conflict point, or came to wait or to go on, bit 5
+            it waits.
     """
 
     _fields_ = [

@@ -24,9 +24,12 @@ codes! {
     pub const STATE_LEFT_NOW: u16 = 4;
     /// [`VehicleState::flags`]: driven by a human. Not to be commanded, and without a plan.
     pub const STATE_HUMAN: u16 = 8;
-    /// [`VehicleState::flags`]: a human who does not follow the passing order passed a conflict point during the step just
-    /// ended (an event of the zone).
+    /// [`VehicleState::flags`]: a human who does not follow the passing order passed a conflict point, or came to wait,
+    /// still waits after a while, or waits no more, during the step just ended (an event of the zone).
     pub const STATE_PASSED: u16 = 16;
+    /// [`VehicleState::flags`]: a human who does not follow the passing order waits: it has stood for some time with a
+    /// conflict point ahead, or is behind one on its lane that has.
+    pub const STATE_WAITS: u16 = 32;
 }
 
 record! {
@@ -74,7 +77,7 @@ record! {
         /// Kind of vehicle: index in the scenario's fleet.
         pub kind: u16,
         /// Bit 0 entered, bit 1 has left, bit 2 somebody left in the step just ended, bit 3 human driver, bit 4 a human
-        /// passed a conflict point.
+        /// passed a conflict point, or came to wait or to go on, bit 5 it waits.
         pub flags: u16,
     }
 }

@@ -9,4 +9,4 @@ mod yielding;
 
 pub use duties::{Duties, Duty, DutyKind, Row};
 pub use geometry::{Conflicts, Point, PointKind, Run, Use};
-pub use yielding::{can_yield, clear_m, has_gone_first, is_in_the_way, line_before_m};
+pub use yielding::{can_yield, clear_m, has_gone_first, is_in_the_way, line_before_m, stands_on};

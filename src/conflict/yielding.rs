@@ -46,6 +46,16 @@ pub fn clear_m(point: &Point, length_m: f64) -> f64 {
     }
 }
 
+/// Whether a vehicle is on a conflict point that another has yet to pass.
+pub fn stands_on(conflicts: &Conflicts, inside: &Row, other: &Row) -> bool {
+    conflicts.uses(inside.path).iter().any(|own| {
+        let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
+        let to_m = own.at_m + clear_m(&conflicts.points()[own.point as usize], inside.length_m);
+        (own.at_m..to_m).contains(&inside.x_m)
+            && theirs.is_some_and(|theirs| !theirs.on_lane_of(own) && other.x_m < theirs.at_m)
+    })
+}
+
 /// Whether a vehicle has entered a box in which another has yet to pass a point that it is not clear of.
 pub fn is_in_the_way(conflicts: &Conflicts, inside: &Row, other: &Row) -> bool {
     conflicts.uses(inside.path).iter().filter(|own| own.box_m <= inside.x_m).any(|own| {

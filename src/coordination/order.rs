@@ -6,10 +6,10 @@
 
 use super::assign::{Assigner, row};
 use super::schedule::{Scene, Scheduler};
-use crate::conflict::{Conflicts, Duties, Row, can_yield, has_gone_first, is_in_the_way};
+use crate::conflict::{Conflicts, Duties, Row, can_yield, has_gone_first, is_in_the_way, stands_on};
 use crate::scenario::{HumanParams, PassingOrder, Scenario, VehicleKind, VehicleParams};
 use crate::shield::{RESERVE_M, Shield, yielding_slack_m};
-use ipc_schemas::{STATE_ENTERED, STATE_HUMAN, VehicleState};
+use ipc_schemas::{STATE_ENTERED, STATE_HUMAN, STATE_WAITS, VehicleState};
 
 /// A vehicle that lets a newcomer pass first keeps at least this much slack, m: it is not to brake hard for it.
 const YIELDING_SLACK_M: f64 = 0.5;
@@ -121,6 +121,40 @@ impl Orders {
         }
         if self.has_humans {
             self.let_humans_first(scene, members, order);
+            self.let_others_pass(scene, members, order);
+        }
+    }
+
+    /// Puts humans who stand and wait behind everybody who can go before them, and with them those that have to stay behind
+    /// them: whom they wait for may be who was to wait for them.
+    fn let_others_pass(&mut self, scene: &Scene<'_>, members: &[VehicleState], order: &mut Order) {
+        if !members.iter().any(waits) {
+            return;
+        }
+        let mut stay = std::mem::take(&mut self.stay);
+        stay.clear();
+        let state_of = |vehicle: u32| members.iter().find(|s| s.vehicle == vehicle);
+        for state in order.vehicles.iter().copied().filter_map(state_of) {
+            let mut behind = stay.iter().copied().filter_map(state_of);
+            if waits(state) || !behind.all(|second| self.may_let_pass(scene, state, second)) {
+                stay.push(state.vehicle);
+            }
+        }
+        order.vehicles.sort_by_key(|vehicle| stay.contains(vehicle));
+        self.stay = stay;
+    }
+
+    /// Whether one may pass before another that waits, or has to stay behind one that does.
+    fn may_let_pass(&mut self, scene: &Scene<'_>, first: &VehicleState, second: &VehicleState) -> bool {
+        if !waits(second) {
+            return self.may_fall_behind(scene, first, second);
+        }
+        let Scene { scenario, conflicts, .. } = *scene;
+        let (a, b) = (row(scenario, first, 0), row(scenario, second, 1));
+        match meeting(conflicts, &a, &b) {
+            Meeting::Nowhere => true,
+            Meeting::OnALane => false,
+            Meeting::AtPoints => !stands_on(conflicts, &b, &a),
         }
     }
 
@@ -131,7 +165,7 @@ impl Orders {
         for state in members {
             let obeys = self.obedient(state).is_some();
             let is_newcomer = state.flags & STATE_ENTERED != 0;
-            if !is_human(state) || obeys && !is_newcomer {
+            if !is_human(state) || waits(state) || obeys && !is_newcomer {
                 continue;
             }
             let vehicle = state.vehicle;
@@ -355,6 +389,11 @@ impl Orders {
 /// Whether somebody drives a vehicle whom nobody commands.
 fn is_human(state: &VehicleState) -> bool {
     state.flags & STATE_HUMAN != 0
+}
+
+/// Whether a human who does not follow the order stands and waits, or is behind one on its lane.
+fn waits(state: &VehicleState) -> bool {
+    state.flags & STATE_WAITS != 0
 }
 
 /// Where two vehicles meet.

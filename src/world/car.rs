@@ -74,8 +74,13 @@ pub(super) struct Visit {
     pub verdict: u16,
     /// Entered during the step just ended.
     pub entered: bool,
-    /// Driven by a human who does not follow the passing order, and passed a conflict point in it.
+    /// Driven by a human who does not follow the passing order, and passed a conflict point in it, or came to wait, still
+    /// waits after a while, or waits no more.
     pub passes: bool,
+    /// Such a human waits: it has stood for so long with a conflict point ahead, or is behind one on its lane that has.
+    pub waits: bool,
+    /// Steps for which such a human has stood.
+    pub stands: u32,
     pub infeasible: bool,
     /// Whether the command in force was no number or beyond the limits as it came.
     pub beyond: bool,
@@ -96,6 +101,8 @@ impl Visit {
         least_cross_m: f64::INFINITY,
         entered: true,
         passes: false,
+        waits: false,
+        stands: 0,
         verdict: VERDICT_NOMINAL,
         infeasible: false,
         beyond: false,

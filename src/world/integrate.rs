@@ -79,7 +79,8 @@ impl World {
             if crosses {
                 self.cross(&scenario, zone, now_s, dt_s);
             }
-            if crosses || passes {
+            let waits = self.observe_waiting(&scenario, zone, dt_s);
+            if crosses || passes || waits {
                 self.events.push(zone as ZoneId);
             }
             while let Some(Queue { road, segment, .. }) =

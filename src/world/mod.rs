@@ -18,6 +18,7 @@ mod owed;
 mod role;
 mod standstill;
 mod traffic;
+mod waiting;
 mod way;
 
 pub use change::ChangeError;

@@ -2,7 +2,7 @@
 
 use super::car::Car;
 use super::role::World;
-use crate::conflict::{Conflicts, Duties, Duty, DutyKind, Row, can_yield, has_gone_first};
+use crate::conflict::{Conflicts, Duties, Duty, DutyKind, Row, can_yield, has_gone_first, stands_on};
 use crate::scenario::{PassingOrder, Scenario, VehicleParams, Zone, ZoneId};
 use crate::shield::{Partner, RESERVE_M, Shield, yielding_slack_m};
 use crate::vehicle::Held;
@@ -144,8 +144,11 @@ impl World {
                         (true, false) => {
                             let own = &self.kinds[usize::from(second.kind)];
                             let human = scenario.human(second.kind).filter(|human| human.obeys());
-                            let waits = |human| can_yield((human, own), conflicts, &a, &b, self.longest_m);
-                            return !has_points_in_common(conflicts, &a, &b) || human.is_some_and(waits);
+                            let can = |human| can_yield((human, own), conflicts, &a, &b, self.longest_m);
+                            let waits = second.visit.waits && !stands_on(conflicts, &b, &a);
+                            return !has_points_in_common(conflicts, &a, &b)
+                                || waits
+                                || human.is_some_and(can);
                         }
                         (false, true) if has_gone_first(conflicts, &a, &b) => return true,
                         (_, true) => {}

@@ -120,6 +120,8 @@ pub(super) struct Scratch {
     pub moved: Vec<Held>,
     /// Those that leave a zone, with the instant within the step, s, and their motion.
     pub leaving: Vec<(f64, Car, Held)>,
+    /// Lanes on which somebody waits.
+    pub held_up: Vec<u32>,
     /// Those that have left a zone and whose motion is assumed until it is known: zone and place.
     pub assumed: Vec<(ZoneId, usize)>,
     pub duties: super::owed::Deriving,
@@ -328,7 +330,8 @@ impl World {
         let members = members.iter().map(move |c| {
             let entered = if c.visit.entered { frames::STATE_ENTERED } else { 0 };
             let passed = if c.visit.passes { frames::STATE_PASSED } else { 0 };
-            self.record(c, zone, entered | passed)
+            let waits = if c.visit.waits { frames::STATE_WAITS } else { 0 };
+            self.record(c, zone, entered | passed | waits)
         });
         left.iter().map(move |c| self.record(c, zone, left_flags)).chain(members)
     }
