@@ -88,10 +88,23 @@ LEFT_EXIT = {"north": "east", "west": "north", "south": "west", "east": "south"}
 FIRST_POINT_M = 300.0
 SPLIT_M = 280.0
 CLEARANCE_M = 10.0
+LEFT_ASIDE_M = 2.67
+
+
+def trimmed(line, by_m):
+    """A line without so much of its end."""
+    line = list(line)
+    while by_m >= (piece_m := math.dist(line[-2], line[-1])):
+        by_m -= piece_m
+        line.pop()
+    (ax, ay), (bx, by) = line[-2:]
+    share = by_m / piece_m
+    return [*line[:-1], (bx - share * (bx - ax), by - share * (by - ay))]
 
 
 def intersection():
     body = 4.5
+    area_m = CLEARANCE_M - body
     segments, paths, crossings = [], [], {}
     for leg, movements in MOVEMENTS.items():
         dx, dy = HEADING[leg]
@@ -99,16 +112,24 @@ def intersection():
             # Every movement reaches its first point after 300 m; the lane runs straight towards it.
             x, y = POINTS[movements[turns[-1]][0]]
             back = lambda m: (x - dx * m, y - dy * m)
-            shape = [back(FIRST_POINT_M), back(FIRST_POINT_M - SPLIT_M)]
+            # Lines cross in the middle of the conflict area, which begins at the published point.
+            split = back(FIRST_POINT_M - SPLIT_M + 0.5 * area_m)
+            shape = [back(FIRST_POINT_M + 0.5 * area_m), split]
             segments.append(segment(f"{leg}-{lane}", shape, f'road = "{leg}-{lane}"'))
             for turn in turns:
                 on_way = [POINTS[k] for k in movements[turn]]
                 last = on_way[-1]
-                shape = [back(FIRST_POINT_M - SPLIT_M), *on_way]
+                shape = [split, back(FIRST_POINT_M - SPLIT_M), *on_way]
                 if turn == "left":
                     ex, ey = -dy, dx
-                    shape.append((last[0] + 8 * ex, last[1] + 8 * ey))
+                    # Straight on until between the lanes beside: on one line with them comes who waits from the other side.
+                    (px, py), slant = on_way[-2], LEFT_ASIDE_M * math.sqrt(2)
+                    long_m = math.dist((px, py), last)
+                    x1 = last[0] + slant * (last[0] - px) / long_m
+                    y1 = last[1] + slant * (last[1] - py) / long_m
+                    shape += [(x1, y1), (x1 + (8 - slant) * ex, y1 + (8 - slant) * ey)]
                 name = f"{leg}-{turn}"
+                shape = trimmed(shape, 0.5 * area_m)
                 inner = FIRST_POINT_M - SPLIT_M
                 total = inner + length(on_way) + (8 if turn == "left" else 0)
                 segments.append(
@@ -136,7 +157,7 @@ def intersection():
     text += listed("segments", segments)
     text += listed("paths", paths)
     places = lambda at: ", ".join(f"{name} = {number(m)}" for name, m in at.items())
-    area = number(CLEARANCE_M - body)
+    area = number(area_m)
     text += listed(
         "crossings",
         [f'{{ name = "p{k}", length_m = {area}, at = {{ {places(crossings[k])} }} }}' for k in sorted(crossings)],

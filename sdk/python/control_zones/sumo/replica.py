@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ElementTree
 import libsumo
 
 from ..world import GONE, Admitted, Newcomer, Traffic
-from .network import Place, cut
+from .network import Place, cut, length
 from .simulation import Car, Simulation, is_automated, make
 
 if typing.TYPE_CHECKING:
@@ -20,12 +20,64 @@ if typing.TYPE_CHECKING:
 MERGE_M = 5.0
 #: What is beyond the last zone, m.
 BEYOND_M = 400.0
+#: How far ways are from each other where they merge or part, m; over how much before a merge, and behind a parting, m.
+APART_M, TAPER_M, PARTING_M = 4.0, 40.0, 15.0
 
 
 def between(line: Sequence[Place], start: float, end: float) -> list[Place]:
     """What of a line is between two shares of its length."""
     behind = cut(line, start)
     return cut(behind[::-1], 1.0 - (end - start) / (1.0 - start))[::-1] if end < 1.0 else behind
+
+
+def straightness(first: Sequence[Place], last: Sequence[Place]) -> float:
+    """The cosine of the angle between the beginning of a way and its end."""
+    (ax, ay), (bx, by), (cx, cy), (dx, dy) = *first[:2], *last[-2:]
+    return ((bx - ax) * (dx - cx) + (by - ay) * (dy - cy)) / (math.dist(first[0], first[1]) * math.dist(last[-2], last[-1]))
+
+
+def aside(line: Sequence[Place], at_end: bool, left: Place, by_m: float, over_m: float) -> list[Place]:
+    """A line moved aside at one of its ends, and less and less over so much of its length."""
+    line = list(line) if at_end else list(line)[::-1]
+    over_m = min(over_m, length(line))
+    end = cut(line, 1.0 - over_m / length(line))
+    before = [] if over_m >= length(line) - 1e-6 else between(line, 0.0, 1.0 - over_m / length(line))[:-1]
+    parts, moved = math.ceil(over_m), []
+    for part in range(parts + 1):
+        share = part / parts
+        x, y = cut(end, share)[0] if part < parts else end[-1]
+        moved.append((x + share * by_m * left[0], y + share * by_m * left[1]))
+    return [*before, *moved] if at_end else [*before, *moved][::-1]
+
+
+def apart(shape: dict[str, typing.Any], drawn: Sequence[Sequence[Place]]) -> list[list[Place]]:
+    """A zone's lines, side by side where they merge and where they part: bodies are in each other's way from a merge on, and until they
+    have passed where ways part, so whoever waits at the one or behind the other stands in nobody's."""
+    lines = [[(float(x), float(y)) for x, y in line] for line in drawn]
+    paths = shape["paths"]
+    merging = [{path["segments"][-1] for path in paths if path["exit"] == exit_} for exit_ in range(len(shape["exits"]))]
+    inner = [path["segments"] for path in paths if len(path["segments"]) > 1]
+    parting = [{way[1] for way in inner if way[0] == first} for first in sorted({way[0] for way in inner})]
+    ways = [path["segments"] for path in paths]
+    straight = {way[part]: straightness(lines[way[0]], lines[way[-1]]) for way in ways for part in (-1, min(1, len(way) - 1))}
+    for group, at_end in [*((group, True) for group in merging), *((group, False) for group in parting)]:
+        if len(group) < 2:
+            continue
+        over_m = TAPER_M if at_end else PARTING_M
+        # Backwards from a merge, forwards from a parting.
+        away = {segment: lines[segment][::-1] if at_end else lines[segment] for segment in group}
+        far = {segment: cut(line, min(0.999, 0.5 * over_m / length(line)))[0] for segment, line in away.items()}
+        x, y = (sum(far[segment][axis] - away[segment][0][axis] for segment in group) for axis in (0, 1))
+        long_m = math.hypot(x, y) or 1.0
+        left = (-y / long_m, x / long_m)
+        # From the right to the left, as they are there.
+        order = sorted(group, key=lambda segment: far[segment][0] * left[0] + far[segment][1] * left[1])
+        # Where lanes lie beside each other whoever goes straight on stays on its own.
+        stays = order.index(max(order, key=lambda segment: straight[segment])) if shape["crossings"] else 0.5 * (len(order) - 1)
+        for place, segment in enumerate(order):
+            if place != stays:
+                lines[segment] = aside(lines[segment], at_end, left, APART_M * (place - stays), over_m)
+    return lines
 
 
 def draw(path: str, roads: dict[str, Sequence[Place]], ways: dict[tuple[str, str], Sequence[Place]]) -> None:
@@ -83,6 +135,7 @@ class Replica:
         ways: dict[tuple[str, str], Sequence[Place]] = {}
         for zone, shape in enumerate(self.network["zones"]):
             segments, lines = shape["segments"], self.shapes[zone]
+            side_by_side = apart(shape, lines)
             middle = lines[shape["paths"][0]["segments"][-1]][-1]
             if len(shape["paths"]) > len(shape["exits"]) and shape["crossings"]:
                 ends = [lines[path["segments"][-1]][-1] for path in shape["paths"]]
@@ -90,7 +143,7 @@ class Replica:
             nodes.append(f'<node id="z{zone}" x="{middle[0]:.2f}" y="{middle[1]:.2f}" type="{junctions}"/>')
             starts = [index for index, segment in enumerate(segments) if segment["source"] is not None]
             for rank, at in enumerate(starts):
-                source, line = segments[at]["source"], lines[at]
+                source, line = segments[at]["source"], side_by_side[at]
                 own_m = float(segments[at]["length_m"]) - self.inside_m(zone, at)
                 begin = f"z{zone}s{at}o"
                 link_m = 0.0
@@ -111,8 +164,9 @@ class Replica:
                 )
             for index, exit_ in enumerate(shape["exits"]):
                 if exit_["to"] is None:
-                    path = next(path for path in shape["paths"] if path["exit"] == index)
-                    line = lines[path["segments"][-1]]
+                    # As the straightest of the ways there goes on: netconvert sees by directions who crosses whom.
+                    leading = [path["segments"] for path in shape["paths"] if path["exit"] == index]
+                    line = lines[max(leading, key=lambda way: straightness(lines[way[0]], lines[way[-1]]))[-1]]
                     (ax, ay), (bx, by) = line[-2], line[-1]
                     long_m = math.dist((ax, ay), (bx, by)) or 1.0
                     x, y = bx + (bx - ax) / long_m * BEYOND_M, by + (by - ay) / long_m * BEYOND_M
@@ -126,10 +180,10 @@ class Replica:
                 first, inner = path["segments"][0], path["segments"][1:]
                 inside_m = self.inside_m(zone, first)
                 own_m = float(segments[first]["length_m"])
-                line = [tuple(place) for place in lines[first]]
+                line = side_by_side[first]
                 drawn = cut(line, 1.0 - inside_m / own_m) if inside_m else []
                 for segment in inner:
-                    drawn += [tuple(place) for place in lines[segment] if not drawn or tuple(place) != drawn[-1]]
+                    drawn += [place for place in side_by_side[segment] if not drawn or place != drawn[-1]]
                 inside_m += sum(float(segments[segment]["length_m"]) for segment in inner)
                 exit_ = shape["exits"][path["exit"]]["to"]
                 to = f"z{zone}x{path['exit']}" if exit_ is None else f"z{exit_['zone']}s{exit_['segment']}"
