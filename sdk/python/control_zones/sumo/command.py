@@ -70,6 +70,15 @@ def command(given: Sequence[str]) -> int:
     beside.add_argument("--seeds", type=int, default=5, metavar="N", help="1 to N [5]")
     beside.add_argument("--rules", type=words, default=["priority", "zipper", "traffic_light"], metavar="TYPE,…", help="of junctions where SUMO's drivers decide")
     beside.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as for `cz run`")
+    shares = commands.add_parser("penetration", help="SUMO's drivers and automated vehicles at every share of these, as tables and figures")
+    shares.add_argument("scenario", nargs="*", help="as for `cz run` [two-merges roundabout]")
+    shares.add_argument("--rules", type=words, metavar="TYPE,…", help="of junctions where SUMO's drivers decide, at every share [priority, and allway_stop at the intersection; others without automated vehicles]")
+    shares.add_argument("--shares", type=percents, default=list(range(0, 101, 10)), metavar="PERCENT,…", help="automated [0,10,…,100]")
+    shares.add_argument("--seeds", type=seeds, default=list(range(4, 14)), metavar="A-B", help="of the scenario, of SUMO and of who is automated [4-13]")
+    shares.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as for `cz run`, beside those of the study")
+    shares.add_argument("--out", metavar="DIR", help="penetration.json, penetration.md and a figure for each scenario")
+    shares.add_argument("--cache", metavar="DIR", help="runs that it holds are not made again, those made are put there")
+    shares.add_argument("--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="runs at a time [one for each core]")
     beside.add_argument("--cz", metavar="PROGRAM", default=os.environ.get("CZ_PROGRAM") or shutil.which("cz"), help="runs our own world [the one this is started by, or cz on the path]")
     for one in (run, again):
         one.add_argument("--penetration", type=float, default=1.0, metavar="P", help="share of automated vehicles [1]")
@@ -111,6 +120,11 @@ def command(given: Sequence[str]) -> int:
 
         compare(args)
         return 0
+    if args.command == "penetration":
+        from .penetration import main as penetration
+
+        penetration(args)
+        return 0
     if not 0.0 <= args.penetration <= 1.0:
         raise Error(f"--penetration is {args.penetration}, expected 0 to 1")
     with tempfile.TemporaryDirectory(prefix=f"cz-sumo-{os.getpid()}-") as folder:
@@ -122,6 +136,23 @@ def counts(text: str) -> list[int]:
     """Numbers of vehicles, as an argument has them."""
     found = [int(one) for one in text.split(",")]
     if not all(1 <= one <= 20_000 for one in found):
+        raise ValueError(text)
+    return found
+
+
+def percents(text: str) -> list[float]:
+    """Shares in per cent, as an argument has them."""
+    found = [float(one) for one in text.split(",")]
+    if not all(0.0 <= one <= 100.0 for one in found):
+        raise ValueError(text)
+    return sorted(set(found))
+
+
+def seeds(text: str) -> list[int]:
+    """A range of seeds, `A-B`, or one seed, as an argument has it."""
+    first, _, last = text.partition("-")
+    found = list(range(int(first), int(last or first) + 1))
+    if not found:
         raise ValueError(text)
     return found
 

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import json
-import math
 import os
-import shlex
-import statistics
-import subprocess
 import sys
 import tempfile
 import typing
 
 from .._session import Error
+from .runs import collided, interval, ran
 
 if typing.TYPE_CHECKING:
     import argparse
     from collections.abc import Sequence
-
-#: The 97.5 % quantile of Student's t by degrees of freedom, from 1.
-T_975 = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093)
-
 
 class Result(typing.NamedTuple):
     """What a run came to."""
@@ -36,43 +28,24 @@ class Result(typing.NamedTuple):
     overlaps: int
 
 
-def interval(values: Sequence[float], digits: int) -> str:
-    """The mean and half of its 95 % interval."""
-    mean = statistics.fmean(values)
-    if len(values) < 2:
-        return f"{mean:.{digits}f}"
-    t = T_975[min(len(values) - 2, len(T_975) - 1)]
-    return f"{mean:.{digits}f} ± {t * statistics.stdev(values) / math.sqrt(len(values)):.{digits}f}"
-
-
 def result(summary: dict[str, typing.Any]) -> Result:
     """What a summary says."""
     zones = summary["zones"]
     sumo = summary.get("sumo")
-    # A sample a step: of a pair, one is enough.
-    pairs = {said.split(": ", 1)[1].split(" on ")[0] for said in sumo["collisions"]} if sumo else set()
     return Result(
         summary["total_objective"],
         sum(zone["mean_time_s"] + zone["mean_wait_s"] for zone in zones),
         sum(zone["mean_energy"] for zone in zones),
         summary["arrived"],
         summary["departed"],
-        len(pairs) if sumo else None,
+        len(collided(summary)) if sumo else None,
         summary["overlaps"]["pairs"],
     )
 
 
 def made(command: list[str], folder: str) -> Result:
     """Makes a run."""
-    path = os.path.join(folder, "summary.json")
-    done = subprocess.run([*command, "--json", path], capture_output=True, text=True, check=False)
-    if done.returncode != 0:
-        words = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
-        raise Error(f"{shlex.join(command)} failed: {words[-1]}")
-    with open(path) as file:
-        found = json.load(file)
-    os.remove(path)
-    return result(found)
+    return result(ran(command, folder))
 
 
 def row(name: str, who: str, results: Sequence[Result], ours: Sequence[Result]) -> str:
