@@ -40,7 +40,7 @@ impl World {
             if stands && x_m < shape.segments[lane as usize].length_m {
                 held_up.push(lane);
             }
-            let is_again = stands && visit.stands % period == 0;
+            let is_again = stands && visit.stands.is_multiple_of(period);
             if waits != visit.waits || is_again {
                 visit.passes = true;
                 is_event = true;
