@@ -25,12 +25,12 @@ impl World {
         held_up.clear();
         let period = ((WAITS_AFTER_S / dt_s) as u32).max(1);
         let mut is_event = false;
-        for at in self.zones[zone].first()..self.cars[zone].len() {
-            let car = &mut self.cars[zone][at];
+        let first = self.zones[zone].first();
+        for (car, held) in self.cars[zone][first..].iter_mut().zip(&motions[first..]) {
             if !car.is_free(scenario) {
                 continue;
             }
-            let (x_m, v_mps) = (motions[at].position_m(dt_s), motions[at].speed_mps(dt_s));
+            let (x_m, v_mps) = (held.position_m(dt_s), held.speed_mps(dt_s));
             let lane = shape.paths[car.path as usize].segments[0];
             let visit = &mut car.visit;
             visit.stands = if v_mps < STANDING_MPS { visit.stands + 1 } else { 0 };
