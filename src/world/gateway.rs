@@ -88,7 +88,7 @@ impl Gateway {
 }
 
 impl World {
-    /// Shares the approaches out over the built-in pool and the plug-ins, `controllers` processes in all.
+    /// Shares the paths out over the built-in pool and the plug-ins, `controllers` processes in all.
     /// Without it, one process drives everything that no plug-in drives.
     pub fn share_out(&mut self, controllers: u32) {
         // A world that goes on from a recording keeps what it has counted.

@@ -211,7 +211,7 @@ pub(super) struct PlanArgs {
     /// Entry speed, m/s.
     #[arg(long, value_name = "M_PER_S")]
     pub v0: f64,
-    /// Length of the approach, m.
+    /// Length of the path, m.
     #[arg(long, value_name = "M")]
     pub length: f64,
     /// Weight of time against energy, m^2/s^4.

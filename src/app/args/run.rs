@@ -14,7 +14,7 @@ pub(in crate::app) struct RunArgs {
     pub in_process: bool,
     #[command(flatten)]
     pub share: ShareArgs,
-    /// Let a program of your own drive zones or approaches, e.g. `--controller merge-2="python3 mine.py"`;
+    /// Let a program of your own drive zones or paths, e.g. `--controller merge-2="python3 mine.py"`;
     /// may be repeated. TARGET is a list such as `merge-1,merge-2.main`, or the name of a controller that
     /// the scenario declares.
     #[arg(long = "controller", value_name = "TARGET=COMMAND")]
