@@ -1,6 +1,7 @@
 //! The processes of a run: thin shells that give the pure roles a clock, signals and a transport.
 
 mod attach;
+mod in_process;
 mod membership;
 mod observe;
 mod outcome;
@@ -25,6 +26,9 @@ mod world;
 mod world_check;
 
 pub use attach::{Attachment, Joining};
+pub use in_process::{
+    run_in_process, run_in_process_observed, run_on_in_process, run_on_in_process_observed,
+};
 pub use observe::{Observation, RecordLag};
 pub use outcome::{LatencyBin, LatencyUs, Outcome, Percentiles, Replacement, WARM_UP_STEPS, new_histogram};
 pub use pace::{MissedBy, OnMiss, Pace, Punctuality, Timing};
@@ -42,10 +46,7 @@ pub use services::expected_vehicles;
 pub use stop::{StopFlag, signals_to_heed};
 pub use viewing::{Notice, Place, Steering, Watched};
 pub use wait::{Patience, WaitMode, Waiter};
-pub use world::{
-    Departure, WorldOptions, check_cores, first_missing_step, new_run_id, run_in_process,
-    run_in_process_observed, run_on_in_process, run_on_in_process_observed, run_world,
-};
+pub use world::{Departure, WorldOptions, check_cores, first_missing_step, new_run_id, run_world};
 pub use world_check::{
     CHANGES, Tolerances, WorldBreach, WorldCheckOptions, WorldReport, WorldRule, check_world,
 };
