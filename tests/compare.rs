@@ -23,7 +23,7 @@ fn comparison(policies: &[&str], seeds: std::ops::RangeInclusive<u64>) -> Compar
 }
 
 fn compare(comparison: &Comparison, jobs: usize, cache: Cache) -> Block {
-    run(comparison, &Means { jobs, cache }, &mut |_, _| {}).unwrap()
+    run(comparison, &Means { jobs, cache }, &mut |_, _, _| {}).unwrap()
 }
 
 fn value(block: &Block, policy: usize, measure: &str, replicate: usize) -> f64 {
@@ -191,7 +191,7 @@ fn policies_are_named_changed_and_refused() {
         (&*unknown, "unknown field `sets`"),
     ] {
         let means = Means { jobs: 1, cache: Cache::none() };
-        let error = run(&comparison(&[policy], 1..=1), &means, &mut |_, _| {}).unwrap_err().to_string();
+        let error = run(&comparison(&[policy], 1..=1), &means, &mut |_, _, _| {}).unwrap_err().to_string();
         assert!(error.contains(words) && !error.contains('\n'), "{error}");
     }
     for (text, expected) in

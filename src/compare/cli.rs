@@ -3,6 +3,7 @@
 use super::cache::Cache;
 use super::report::{FORMAT, Report};
 use super::{CompareError, Comparison, Means, policy, run, tables};
+use crate::reproduce::ReproduceError;
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
@@ -53,8 +54,13 @@ pub struct LabArgs {
 }
 
 impl LabArgs {
-    /// Threads and cache.
+    /// Threads and cache; the directory of the results is made.
     pub(super) fn means(&self) -> Result<Means, CompareError> {
+        // Hours of work are not to be lost to a directory that cannot be.
+        if let Some(out) = &self.out {
+            let failed = |source| ReproduceError::Write { path: out.clone(), source };
+            std::fs::create_dir_all(out).map_err(failed)?;
+        }
         let cores = std::thread::available_parallelism().map_or(1, usize::from);
         let cache = self.cache.as_deref().map_or(Ok(Cache::none()), Cache::at)?;
         Ok(Means { jobs: self.jobs.map_or(cores, usize::from), cache })
@@ -101,10 +107,10 @@ fn after_help() -> String {
     format!("Policies: {}.\nTables: {}.", policy::known(), tables::names().collect::<Vec<_>>().join(", "))
 }
 
-/// Shows how many runs are done.
+/// Shows how much is done.
 pub fn bar() -> ProgressBar {
     ProgressBar::new(0).with_style(
-        ProgressStyle::with_template("{msg} {bar:30} {pos}/{len} runs, {elapsed} gone, {eta} to go")
+        ProgressStyle::with_template("{msg} {bar:30} {pos}/{len}, {elapsed} gone, {eta} to go")
             .expect("the template is a constant"),
     )
 }
@@ -125,8 +131,9 @@ pub fn main(args: &CompareArgs) -> Result<String, CompareError> {
     let bar = bar();
     let mut blocks = Vec::new();
     for comparison in &comparisons {
-        bar.set_message(comparison.scenario.clone().unwrap_or_default());
-        blocks.push(run(comparison, &means, &mut |done, total| {
+        let scenario = comparison.scenario.clone().unwrap_or_default();
+        blocks.push(run(comparison, &means, &mut |work, done, total| {
+            bar.set_message(format!("{scenario} {}", work.name()));
             bar.set_length(total as u64);
             bar.set_position(done as u64);
         })?);

@@ -217,13 +217,18 @@ pub const MEASURES: [Measure; 30] = [
     measure("least_safe_rear_end_m", "least rear-end margin, entered safe", Some("m"), 3, Pool::Least, |r| {
         least(r.zones.iter().map(|z| z.least_safe_m[0]))
     }),
-    measure("least_safe_merge_m", "least merging margin, entered safe", Some("m"), 3, Pool::Least, |r| {
-        least(r.zones.iter().map(|z| z.least_safe_m[1]))
-    }),
+    measure(
+        "least_safe_merge_m",
+        "least merging or crossing margin, entered safe",
+        Some("m"),
+        3,
+        Pool::Least,
+        |r| least(r.zones.iter().map(|z| z.least_safe_m[1])),
+    ),
     measure("least_rear_end_m", "least rear-end margin, all", Some("m"), 3, Pool::Least, |r| {
         least(r.zones.iter().map(|z| z.least_m[0]))
     }),
-    measure("least_merge_m", "least merging margin, all", Some("m"), 3, Pool::Least, |r| {
+    measure("least_merge_m", "least merging or crossing margin, all", Some("m"), 3, Pool::Least, |r| {
         least(r.zones.iter().map(|z| z.least_m[1]))
     }),
 ];

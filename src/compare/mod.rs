@@ -18,7 +18,6 @@ pub mod tables;
 use crate::bounds::{Bounds, joint};
 use crate::reproduce::ReproduceError;
 use crate::reproduce::parallel;
-use crate::reproduce::runs::Progress;
 use crate::scenario::{self, Override, Scenario, ScenarioError};
 use cache::Cache;
 use measure::Row;
@@ -105,6 +104,31 @@ pub enum CompareError {
     Failed(#[from] ReproduceError),
 }
 
+/// What a comparison is at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Work {
+    /// Running the policies.
+    Runs,
+    /// Working out rigorous bounds.
+    Bounds,
+    /// Seeking centralised optima.
+    Optima,
+}
+
+impl Work {
+    /// What there is a number of.
+    pub fn name(self) -> &'static str {
+        match self {
+            Work::Runs => "runs",
+            Work::Bounds => "bounds",
+            Work::Optima => "optima",
+        }
+    }
+}
+
+/// Told how many of what are done, of how many known so far.
+pub type Progress<'a> = dyn FnMut(Work, usize, usize) + 'a;
+
 /// One run: a seed under `--set`s.
 type Key = (u64, Vec<String>);
 
@@ -150,7 +174,7 @@ impl Performed<'_> {
         };
         parallel::each(self.means.jobs, &missing, work, |(_, key), result: (Arc<Scenario>, Sample)| {
             fresh.insert(key.clone(), result);
-            progress(before + fresh.len(), total);
+            progress(Work::Runs, before + fresh.len(), total);
         })
         .map_err(|error: CompareError| error)?;
         self.samples.append(&mut fresh);
@@ -164,7 +188,7 @@ pub fn load(argument: Option<&str>, seed: u64, sets: &[String]) -> Result<Arc<Sc
     Ok(Arc::new(scenario::load(argument, &overrides, Some(seed))?))
 }
 
-/// Compares. `progress` is told how many runs are done, of how many known so far.
+/// Compares.
 pub fn run(
     comparison: &Comparison,
     means: &Means,
@@ -176,9 +200,14 @@ pub fn run(
     let mut performed = Performed { comparison, means, samples: BTreeMap::new(), total: 0 };
     let first = performed.key(comparison.seeds[0], Vec::new());
     let base = load(comparison.scenario.as_deref(), first.0, &first.1)
-        .map_err(|source| CompareError::Scenario { name: "none".into(), source: Box::new(source) })?;
+        .map_err(|source| CompareError::Usage(source.to_string()))?;
     let policies = comparison.policies.iter().map(|name| policy::find(name, &base.network));
     let policies: Vec<Policy> = policies.collect::<Result<_, _>>()?;
+    for (at, name) in comparison.policies.iter().enumerate() {
+        if comparison.policies[..at].contains(name) {
+            return Err(CompareError::Usage(format!("policy {name}: named twice; expected once")));
+        }
+    }
     let named = |name: &String| {
         let at = policies.iter().position(|policy| policy.name == *name);
         at.ok_or_else(|| {
@@ -280,10 +309,11 @@ fn bounds(
         performed.means.cache.bounds(scenario, sample)
     };
     let (mut done, total) = (0, alike.len());
+    progress(Work::Bounds, done, total);
     parallel::each(performed.means.jobs, &alike, work, |keys, bounds: Bounds| {
         found.extend(keys.iter().map(|key| ((*key).clone(), bounds.clone())));
         done += 1;
-        progress(done, total);
+        progress(Work::Bounds, done, total);
     })?;
     Ok(found)
 }
@@ -297,13 +327,14 @@ fn seek_joint(
 ) -> Result<(), CompareError> {
     let replicates: Vec<(usize, &Key)> = taken.iter().map(|(key, _)| key).enumerate().collect();
     let mut found: BTreeMap<usize, Option<joint::Found>> = BTreeMap::new();
+    progress(Work::Optima, 0, replicates.len());
     let work = |&(_, key): &(usize, &Key)| {
         let (scenario, sample) = &performed.samples[key];
         performed.means.cache.joint(scenario, sample)
     };
     parallel::each(performed.means.jobs, &replicates, work, |(at, _), result| {
         found.insert(*at, result);
-        progress(found.len(), replicates.len());
+        progress(Work::Optima, found.len(), replicates.len());
     })?;
     for policy_rows in rows {
         for (at, row) in policy_rows.iter_mut().enumerate() {

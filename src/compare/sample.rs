@@ -47,9 +47,9 @@ pub struct ZoneSample {
     pub infeasible: u32,
     /// Vehicles in feasibility-enforcement mode.
     pub enforced: u32,
-    /// Least margins of vehicles that entered safe, m: rear end, merge.
+    /// Least margins of vehicles that entered safe, m: rear end, merge or crossing.
     pub least_safe_m: [Option<f64>; 2],
-    /// Least margins of all vehicles, m: rear end, merge.
+    /// Least margins of all vehicles, m: rear end, merge or crossing.
     pub least_m: [Option<f64>; 2],
 }
 
@@ -237,8 +237,11 @@ impl Observer {
             exposure_ms: z.mean_exposure_m_s,
             infeasible: z.infeasible_vehicles,
             enforced: z.fe_vehicles,
-            least_safe_m: [z.min_rear_end_margin_clean_m, z.min_merge_margin_clean_m],
-            least_m: [z.min_rear_end_margin_m, z.min_merge_margin_m],
+            least_safe_m: [
+                z.min_rear_end_margin_clean_m,
+                lesser(z.min_merge_margin_clean_m, z.min_cross_margin_clean_m),
+            ],
+            least_m: [z.min_rear_end_margin_m, lesser(z.min_merge_margin_m, z.min_cross_margin_m)],
         });
         Sample {
             state_hash: world.state_hash(),
@@ -266,6 +269,11 @@ fn fuel_ml(v0_mps: f64, u_mps2: f64, dt_s: f64) -> f64 {
     // Simpson's rule is exact: v is linear in time, the rate a cubic in v.
     let at = |t: f64| rate(v0_mps + u_mps2 * t);
     dt_s / 6.0 * (at(0.0) + 4.0 * at(0.5 * dt_s) + at(dt_s))
+}
+
+/// The lesser of two margins, of which either may be one that nobody had.
+fn lesser(a_m: Option<f64>, b_m: Option<f64>) -> Option<f64> {
+    a_m.into_iter().chain(b_m).min_by(f64::total_cmp)
 }
 
 #[cfg(test)]

@@ -293,6 +293,7 @@ pub fn main(args: &StudyArgs) -> Result<String, CompareError> {
         }
     }
     let bar = bar();
+    bar.set_message("runs");
     bar.set_length(wanted.len() as u64);
     let mut found: BTreeMap<(usize, usize, u64), Showed> = BTreeMap::new();
     let work = |&(at, value, seed): &(usize, usize, u64)| {
