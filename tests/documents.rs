@@ -321,9 +321,8 @@ fn keys_of_set_exist() {
             let after = |option: &str| words.windows(2).find(|pair| pair[0] == option).map(|pair| &pair[1]);
             // The default scenario where none is named, as with recordings, or any (`NAME`).
             let argument = words.get(2).filter(|_| words[1] == "run").or(after("--scenario"));
-            let named = argument.filter(|name| {
-                name.contains(|c: char| c.is_ascii_lowercase()) && !name.starts_with("--")
-            });
+            let named = argument
+                .filter(|name| name.contains(|c: char| c.is_ascii_lowercase()) && !name.starts_with("--"));
             // Traces of some seeds exist and of others do not: the first of a range is one of those meant.
             let seed = after("--seeds").and_then(|seeds| seeds.split_once('-')?.0.parse().ok());
             let overrides: Result<Vec<Override>, _> = sets.iter().map(|set| set.parse()).collect();

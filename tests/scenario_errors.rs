@@ -377,7 +377,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "segment_m = 50",
         "segment_m = 151",
-        "s.toml:26: zones.first.flow.segment_m = 151: expected a length with 0 < l <= 150 m, the longest approach of the zone downstream, second",
+        "s.toml:26: zones.first.flow.segment_m = 151: expected a length with 0 < l <= 150 m, the longest path of the zone downstream, second",
     ),
     (
         "policy = \"fixed\", terminal_mps = 15",
@@ -432,7 +432,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "road = \"north\"",
         "road = \"west\"",
-        "s.toml:42: zones.second.approaches.b.road = \"west\": zones.first.approaches.a.road uses this road already; expected a road no other approach uses",
+        "s.toml:42: zones.second.approaches.b.road = \"west\": zones.first.approaches.a.road uses this road already; expected a road that nothing else uses",
     ),
     (
         "road = \"north\"",
@@ -467,7 +467,7 @@ const FILE_CASES: &[(&str, &str, &str)] = &[
     (
         "[[zones.approaches]]\nname = \"b\"\nlength_m = 100\nroad = \"north\"\n",
         "",
-        "s.toml:16: roads.north.name = \"north\": no approach uses this road; expected an approach with this road as its source",
+        "s.toml:16: roads.north.name = \"north\": no zone uses this road; expected a zone with this road as a source",
     ),
     (
         "road = \"west\"",

@@ -186,10 +186,11 @@ impl Summary {
         ))
     }
 
-    fn table(&self) -> String {
+    /// Zone by zone, and in total.
+    fn zone_table(&self) -> Table {
         let mut table = Table::new();
         table.load_style(presets::UTF8_HORIZONTAL_ONLY);
-        table.set_header([
+        let mut header = vec![
             "zone",
             "vehicles",
             "wait\n[s]",
@@ -202,11 +203,14 @@ impl Summary {
             "exposure\n[m s]",
             "rear-end margin\nall / entered safe [m]",
             "merge margin\nall / entered safe [m]",
-        ]);
+        ];
+        let anybody_crosses = self.zones.iter().any(|zone| zone.min_cross_margin_m.is_some());
+        header.extend(anybody_crosses.then_some("cross margin\nall / entered safe [m]"));
+        table.set_header(header);
         for zone in &self.zones {
             let margins =
                 |all: Option<f64>, clean: Option<f64>| format!("{} / {}", metres(all), metres(clean));
-            table.add_row([
+            let mut row = vec![
                 zone.zone.clone(),
                 zone.vehicles.to_string(),
                 format!("{:.3}", zone.mean_wait_s),
@@ -219,7 +223,11 @@ impl Summary {
                 format!("{:.3}", zone.mean_exposure_m_s),
                 margins(zone.min_rear_end_margin_m, zone.min_rear_end_margin_clean_m),
                 margins(zone.min_merge_margin_m, zone.min_merge_margin_clean_m),
-            ]);
+            ];
+            row.extend(
+                anybody_crosses.then(|| margins(zone.min_cross_margin_m, zone.min_cross_margin_clean_m)),
+            );
+            table.add_row(row);
         }
         let mut total = vec![Cell::new("total"), Cell::new(self.departed)];
         total.extend(["", "", ""].map(Cell::new));
@@ -228,19 +236,24 @@ impl Summary {
         for column in table.column_iter_mut().skip(1) {
             column.set_cell_alignment(CellAlignment::Right);
         }
+        table
+    }
+
+    fn table(&self) -> String {
         let how = match self.processes {
             1 => "in one process".to_owned(),
             n => format!("in {n} processes over {}", self.transport),
         };
         let l = &self.step_latency_us;
         let mut text = format!(
-            "{}, seed {}: {} steps of {} s {how}, {:.2} s wall time\n{table}\n\
+            "{}, seed {}: {} steps of {} s {how}, {:.2} s wall time\n{}\n\
              step latency p50 {:.1} µs, p99 {:.1}, p99.9 {:.1}, max {:.1}; beta {:.4}; arrivals from {}\n",
             self.scenario,
             self.seed,
             self.steps,
             self.dt_s,
             self.wall_s,
+            self.zone_table(),
             l.p50,
             l.p99,
             l.p999,
@@ -257,6 +270,20 @@ impl Summary {
         let gone = self.departed + self.traffic.as_ref().map_or(0, |traffic| traffic.gone);
         if self.arrived > gone {
             text.push_str(&format!("{} vehicles were still inside at the end\n", self.arrived - gone));
+        }
+        let sum = |of: fn(&ZoneSummaryRow) -> u32| self.zones.iter().map(of).sum::<u32>();
+        let disorder = [
+            (sum(|z| z.orders_refused), "passing orders that the world did not adopt"),
+            (sum(|z| z.order_violations), "passings before one that was to pass first"),
+            (sum(|z| z.overtakes), "samples ahead of the own leader"),
+        ];
+        let told: Vec<String> = disorder
+            .iter()
+            .filter(|(count, _)| *count > 0)
+            .map(|(count, what)| format!("{what}: {count}"))
+            .collect();
+        if !told.is_empty() {
+            text.push_str(&format!("{}\n", told.join("; ")));
         }
         shield_lines(&self.shield, &mut text);
         for warning in self.warnings() {
@@ -369,19 +396,21 @@ fn shield_lines(shield: &ShieldSummary, text: &mut String) {
     }
     for row in &shield.controllers {
         text.push_str(&format!(
-            "shield {}, {}: {} of {} commands bounded (by rear end {}, merge {}, speed {}, limits {}, no \
-             number {}); least margins of guaranteed vehicles {} / {} m; {} pairs began unsafe\n",
+            "shield {}, {}: {} of {} commands bounded (by rear end {}, merge {}, cross {}, speed {}, limits \
+             {}, no number {}); least margins of guaranteed vehicles {} / {} / {} m; {} pairs began unsafe\n",
             shield.mode.name(),
             row.controller,
             row.bounded,
             row.commands,
             row.rear_end,
             row.merge,
+            row.cross,
             row.speed,
             row.limits,
             row.not_finite,
             metres(row.min_rear_end_margin_m),
             metres(row.min_merge_margin_m),
+            metres(row.min_cross_margin_m),
             row.began_unsafe
         ));
         if row.lost > 0 {

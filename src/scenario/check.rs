@@ -249,7 +249,7 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
             length_m += segment.map_or(0.0, |s| s.length_m);
         }
         require(path.length_m == length_m, bad)?;
-        inside("length_m", length_m, &ranges::APPROACH_LENGTH)?;
+        inside("length_m", length_m, &ranges::PATH_LENGTH)?;
         number("length_m", length_m, |l| l >= step_m)?;
         within(&keys::SHARE, path.share)?;
         require((path.exit as usize) < zone.exits.len(), bad)?;

@@ -104,7 +104,7 @@ pub(in crate::scenario) static KEYS: Keys = &[
     ),
 ];
 
-/// What a zone's policy can observe: the lengths of the approaches of the zone downstream, if there is one.
+/// What a zone's policy can observe: the lengths of the paths of the zone downstream, if there is one.
 pub(in crate::scenario) struct Downstream<'a> {
     pub(in crate::scenario) zone: &'a str,
     pub(in crate::scenario) longest_m: f64,
@@ -168,7 +168,7 @@ pub(in crate::scenario) fn flow(
     let longest = downstream.longest_m;
     let segment_ok = |l| l > 0.0 && l <= longest;
     let segment = format!(
-        "a length with 0 < l <= {longest} m, the longest approach of the zone downstream, {}",
+        "a length with 0 < l <= {longest} m, the longest path of the zone downstream, {}",
         downstream.zone
     );
     let gain_mps = t.within("gain_mps", &ranges::FLOW_GAIN)?;

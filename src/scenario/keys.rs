@@ -465,11 +465,11 @@ pub(in crate::scenario) static SEGMENTS: Keys = &[
     &other("name", "text", "required", "unique in the zone"),
     &other("length_m", "a length from 0.01 to 1e6 m", "that of `shape`", ""),
     &other("shape", "list of points `[x, y]` in m", "not drawn to scale", "how it lies"),
-    &other("road", "text", "no entrance", "of an entrance: as of an approach"),
-    &other("zone", "text", "no entrance", "of an entrance: as of an approach"),
-    &other("exit", "text", "its only exit", "as of an approach"),
-    &other("link_m", "as of an approach", "0", ""),
-    &other("link_speed_mps", "as of an approach", "half of `v_max_mps`", ""),
+    &other("road", "text", "no entrance", "of an entrance: as in `zones.approaches`"),
+    &other("zone", "text", "no entrance", "of an entrance: as in `zones.approaches`"),
+    &other("exit", "text", "its only exit", "as in `zones.approaches`"),
+    &other("link_m", "as in `zones.approaches`", "0", ""),
+    &other("link_speed_mps", "as in `zones.approaches`", "half of `v_max_mps`", ""),
 ];
 pub(in crate::scenario) static PATHS: Keys = &[
     &other("name", "text", "required", "unique in the zone"),

@@ -128,7 +128,7 @@ pub struct ControlParams {
     pub feasibility_rows: bool,
     /// Entry conditions of FE mode.
     pub fe_conditions: FeConditions,
-    /// Fraction of the approach within which FE mode may act (paper: L/4).
+    /// Fraction of the path within which FE mode may act (paper: L/4).
     pub fe_fraction: f64,
     /// What concerns the law `viable` alone.
     pub viable: ViableParams,

@@ -41,9 +41,9 @@ pub(super) const BETA: Range = range("a weight", 1e-6, 1e6, "m^2/s^4");
 pub(super) const GAIN: Range = range("a gain", 1e-6, 1e6, "1/s");
 /// `control.slack_weight`.
 pub(super) const SLACK_WEIGHT: Range = Range { zero: true, ..range("a weight", 1e-6, 1e6, "m^2/s^4") };
-/// `zones.approaches.length_m`. A frame has room for the vehicles that fit.
-pub(super) const APPROACH_LENGTH: Range = range("a length", 1.0, 1e6, "m");
-/// `zones.segments.length_m`; a path as a whole has at least [`APPROACH_LENGTH`].
+/// `zones.approaches.length_m`, and of every path. A frame has room for the vehicles that fit.
+pub(super) const PATH_LENGTH: Range = range("a length", 1.0, 1e6, "m");
+/// `zones.segments.length_m`; a path as a whole has at least [`PATH_LENGTH`].
 pub(super) const SEGMENT_LENGTH: Range = range("a length", 0.01, 1e6, "m");
 /// `zones.crossings.length_m`.
 pub(super) const CROSSING_LENGTH: Range = range("a length", 0.1, 1000.0, "m");
@@ -115,7 +115,8 @@ impl fmt::Display for Range {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Range { least, greatest, zero, what, unit } = *self;
         let zero = if zero { "0, or " } else { "" };
-        write!(f, "{zero}{what} from {} to {} {unit}", Short(least), Short(greatest))
+        write!(f, "{zero}{what} from {} to {}", Short(least), Short(greatest))?;
+        if unit.is_empty() { Ok(()) } else { write!(f, " {unit}") }
     }
 }
 

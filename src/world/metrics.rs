@@ -23,6 +23,7 @@ pub(super) struct ZoneMetrics {
     pub least_merge_m: f64,
     pub least_merge_clean_m: f64,
     pub least_cross_m: f64,
+    pub least_cross_clean_m: f64,
     pub order_violations: u32,
     pub overtakes: u32,
 }
@@ -43,6 +44,7 @@ impl Default for ZoneMetrics {
             least_merge_m: f64::INFINITY,
             least_merge_clean_m: f64::INFINITY,
             least_cross_m: f64::INFINITY,
+            least_cross_clean_m: f64::INFINITY,
             order_violations: 0,
             overtakes: 0,
         }
@@ -74,6 +76,7 @@ impl ZoneMetrics {
         self.least_merge_m = self.least_merge_m.min(visit.least_merge_m);
         if visit.clean_merge {
             self.least_merge_clean_m = self.least_merge_clean_m.min(visit.least_merge_m);
+            self.least_cross_clean_m = self.least_cross_clean_m.min(visit.least_cross_m);
         }
         self.least_cross_m = self.least_cross_m.min(visit.least_cross_m);
     }
@@ -99,6 +102,7 @@ impl ZoneMetrics {
             min_cross_margin_m: seen(self.least_cross_m),
             min_rear_end_margin_clean_m: seen(self.least_rear_end_clean_m),
             min_merge_margin_clean_m: seen(self.least_merge_clean_m),
+            min_cross_margin_clean_m: seen(self.least_cross_clean_m),
             order_violations: self.order_violations,
             overtakes: self.overtakes,
             orders_refused: 0,
@@ -141,7 +145,7 @@ impl CompletedVisit {
 pub struct ZoneSummaryRow {
     /// Zone name.
     pub zone: String,
-    /// Vehicles that passed the conflict point.
+    /// Vehicles that left the zone.
     pub vehicles: u32,
     /// Mean travel time, s.
     pub mean_time_s: f64,
@@ -171,6 +175,8 @@ pub struct ZoneSummaryRow {
     /// The same for vehicles that were viable toward each one that merges or crosses first when they came to owe it
     /// something.
     pub min_merge_margin_clean_m: Option<f64>,
+    /// The same at crossings.
+    pub min_cross_margin_clean_m: Option<f64>,
     /// Times a vehicle passed a conflict point before one that was to pass it first.
     pub order_violations: u32,
     /// Samples at which a vehicle was ahead of its leader.

@@ -1,6 +1,6 @@
 //! `roads.*.routes`: which ways the vehicles of a road may take.
 
-use super::error::ScenarioError;
+use super::error::{ScenarioError, nearest};
 use super::table::{Table, unique_names};
 
 use crate::scenario::{Route, Zone, keys};
@@ -39,9 +39,10 @@ fn route(
         let open: Vec<(u32, String)> = open.collect();
         let Some((path, _)) = open.iter().find(|(_, name)| name == word) else {
             let known: Vec<&str> = open.iter().map(|(_, name)| name.as_str()).collect();
-            return Err(
-                item.bad(&format!("a path that begins where the one before leads: {}", known.join(", ")))
-            );
+            let begins = if paths.is_empty() { "the road leads" } else { "the one before leads" };
+            let hint = nearest(word, known.iter().copied());
+            let hint = hint.map(|hint| format!("; did you mean {hint}?")).unwrap_or_default();
+            return Err(item.bad(&format!("a path that begins where {begins}: {}{hint}", known.join(", "))));
         };
         paths.push(*path);
         next = here.exit_of(*path).to.map(|to| (to.zone, to.segment));

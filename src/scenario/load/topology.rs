@@ -60,9 +60,9 @@ pub(super) fn read(
         match claim {
             Some((zone, segment, _)) => road_ends.push((*zone, *segment)),
             None => {
-                let expected = "an approach with this road as its source";
+                let expected = "a zone with this road as a source";
                 let field = table.need("name", expected)?;
-                return Err(field.bad_because(Some("no approach uses this road".into()), expected));
+                return Err(field.bad_because(Some("no zone uses this road".into()), expected));
             }
         }
     }
@@ -131,7 +131,7 @@ fn zone<'a>(
 
 /// How long something must be that a vehicle may not pass within one step.
 fn whole_length(step_m: f64) -> (impl Fn(f64) -> bool, String) {
-    let length = ranges::APPROACH_LENGTH;
+    let length = ranges::PATH_LENGTH;
     let why = "v_max_mps * dt_s, so that a vehicle passes at most one boundary per step";
     (move |l| length.contains(l) && l >= step_m, format!("{length}, >= {step_m} m = {why}"))
 }
@@ -366,7 +366,7 @@ impl<'a> Claims<'a> {
                 let road = find(&field, "road", road_names)?;
                 if let Some((_, _, other)) = &self.roads[road] {
                     let problem = Some(format!("{other} uses this road already"));
-                    return Err(field.bad_because(problem, "a road no other approach uses"));
+                    return Err(field.bad_because(problem, "a road that nothing else uses"));
                 }
                 self.roads[road] = Some((zone, segment, t.key("road")));
                 // A road by --set in place of the file's zone leaves that zone's keys without meaning.
@@ -463,6 +463,7 @@ impl<'a> Claims<'a> {
 /// Index of the name a field gives.
 fn find(field: &Field<'_>, what: &str, names: &[&str]) -> Result<usize, ScenarioError> {
     let expected = || {
+        let article = if what.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" };
         let word = field.str("").unwrap_or("");
         let hint = nearest(word, names.iter().copied());
         let hint = hint.map(|h| format!("; did you mean {h}?")).unwrap_or_default();
@@ -470,7 +471,7 @@ fn find(field: &Field<'_>, what: &str, names: &[&str]) -> Result<usize, Scenario
         if names.len() > 20 {
             list += ", ...";
         }
-        format!("the name of a {what}: {list}{hint}")
+        format!("the name of {article} {what}: {list}{hint}")
     };
     let name = field.str("").map_err(|_| field.bad(&expected()))?;
     let found = names.iter().position(|n| *n == name);
