@@ -180,6 +180,32 @@ fn holds_for_everybody<A: FnMut(u64, &VehicleState) -> f64>(what: &str, adversar
     }
 }
 
+/// The same where paths cross and part: nobody who comes through such a gate is ever unsafe.
+fn holds_where_paths_cross<A: FnMut(u64, &VehicleState) -> f64>(what: &str, adversary: impl Fn() -> A) {
+    for network in ["intersection", "roundabout", "lane-drop", "grid-3x3"] {
+        let mut held = 0;
+        for order in [PassingOrder::Fifo, PassingOrder::PerPoint, PassingOrder::Resequenced] {
+            let mut scenario = (*busy(network, "on", 900.0, 100_000)).clone();
+            scenario.network.roads.iter_mut().for_each(|road| road.entry = EntryRule::Viable);
+            scenario.network.zones.iter_mut().for_each(|zone| zone.order = order);
+            let (row, commanded, world) = attack(&Arc::new(scenario), 100_000, adversary());
+            let summary = world.summary();
+            let what = format!("{what}, {network}, {order:?}");
+            println!("{what}: {commanded} vehicle-steps, {} held; {row:?}", summary.held_arrivals);
+            assert_eq!(
+                (row.began_unsafe, row.lost, summary.overlaps.pairs),
+                (0, 0, 0),
+                "{what}: {summary:?}"
+            );
+            held += summary.held_arrivals;
+            for margin in [row.min_rear_end_margin_m, row.min_merge_margin_m, row.min_cross_margin_m] {
+                assert!(margin.is_none_or(|m| m >= 0.0), "{what}: {row:?}");
+            }
+        }
+        assert!(held > 0, "{what}, {network}: the gate has nothing to do");
+    }
+}
+
 /// Everybody speeds up wherever somebody else may be, and brakes where nobody is.
 fn contrary() -> impl FnMut(u64, &VehicleState) -> f64 {
     |step, s| if (step / 40 + u64::from(s.vehicle)).is_multiple_of(2) || s.x_m > 150.0 { 4.0 } else { -4.0 }
@@ -197,6 +223,15 @@ fn a_gate_makes_it_hold_for_everybody() {
     holds_for_everybody("leaders that stop", leaders_that_stop);
     holds_for_everybody("contrary", contrary);
     holds_for_everybody("waves", waves);
+}
+
+#[test]
+fn a_gate_makes_it_hold_where_paths_cross() {
+    holds_where_paths_cross("full acceleration", always_u_max);
+    holds_where_paths_cross("random flips", random_flips);
+    holds_where_paths_cross("leaders that stop", leaders_that_stop);
+    holds_where_paths_cross("contrary", contrary);
+    holds_where_paths_cross("waves", waves);
 }
 
 /// What is assumed of the gate and of the gap is needed: without either the same drivers do harm, shield or not.
@@ -265,24 +300,22 @@ fn withstands_leaders_that_stop_where_paths_cross() {
 #[test]
 fn traffic_never_locks_up() {
     for network in ["intersection", "roundabout", "lane-drop", "grid-3x3"] {
-        for order in ["fifo", "per_point"] {
+        for order in [PassingOrder::Fifo, PassingOrder::PerPoint, PassingOrder::Resequenced] {
             let base = busy(network, "on", 900.0, 400);
             let mut scenario = (*base).clone();
-            for zone in &mut scenario.network.zones {
-                zone.order = if order == "fifo" { PassingOrder::Fifo } else { PassingOrder::PerPoint };
-            }
+            scenario.network.zones.iter_mut().for_each(|zone| zone.order = order);
             let summary = built_in(&Arc::new(scenario));
             let ShieldRow { lost, began_unsafe, .. } = summary.shield.controllers[0];
             println!(
-                "{network}, {order}: {} steps, {} of {} left, {began_unsafe} began unsafe, {:?}, orders refused {}",
+                "{network}, {order:?}: {} steps, {} of {} left, {began_unsafe} began unsafe, {:?}, orders refused {}",
                 summary.steps,
                 summary.departed,
                 summary.arrived,
                 summary.overlaps,
                 summary.zones.iter().map(|z| z.orders_refused).sum::<u32>()
             );
-            assert_eq!((summary.departed, summary.waiting), (400, 0), "{network}, {order}");
-            assert_eq!(lost, 0, "{network}, {order}");
+            assert_eq!((summary.departed, summary.waiting), (400, 0), "{network}, {order:?}");
+            assert_eq!(lost, 0, "{network}, {order:?}");
         }
     }
 }
@@ -290,7 +323,7 @@ fn traffic_never_locks_up() {
 /// Behind a gate nobody is ever unsafe, and bodies never touch, where paths part either.
 #[test]
 fn a_gate_keeps_bodies_apart_in_a_full_roundabout() {
-    for order in [PassingOrder::Fifo, PassingOrder::PerPoint] {
+    for order in [PassingOrder::Fifo, PassingOrder::PerPoint, PassingOrder::Resequenced] {
         let mut scenario = (*busy("roundabout", "on", 700.0, 300)).clone();
         scenario.network.roads.iter_mut().for_each(|road| road.entry = EntryRule::Viable);
         scenario.network.zones.iter_mut().for_each(|zone| zone.order = order);

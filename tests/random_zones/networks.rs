@@ -1,7 +1,7 @@
 //! Networks drawn at random, as texts that the loader reads: segments, merges, diverges, crossings, exits, links,
 //! routes, orders, kinds of vehicles, demand.
 
-use control_zones::scenario::{Scenario, load_given};
+use control_zones::scenario::{PassingOrder, Scenario, load_given};
 use proptest::prelude::*;
 use std::fmt::Write as _;
 
@@ -10,6 +10,13 @@ pub const DEMAND_S: f64 = 60.0;
 /// By then everybody must have left, s.
 pub const END_S: f64 = 2400.0;
 const DT_S: f64 = 0.1;
+
+/// The passing orders there are, with their words.
+pub const ORDERS: [(PassingOrder, &str); 3] = [
+    (PassingOrder::Fifo, "fifo"),
+    (PassingOrder::PerPoint, "per_point"),
+    (PassingOrder::Resequenced, "resequenced"),
+];
 
 /// What is drawn; indices are taken modulo what there is.
 #[derive(Clone, Debug)]
@@ -39,7 +46,8 @@ pub struct RawZone {
     pub paths: Vec<RawPath>,
     pub crossings: Vec<RawCrossing>,
     pub exits: Vec<RawExit>,
-    pub per_point: bool,
+    /// Which of the passing orders there are.
+    pub order: usize,
     pub demands: Vec<RawDemand>,
 }
 
@@ -98,11 +106,18 @@ fn zone() -> impl Strategy<Value = RawZone> {
         prop::collection::vec(path, 1..=6),
         prop::collection::vec(crossing, 0..=5),
         prop::collection::vec(exit, 1..=3),
-        any::<bool>(),
+        0..ORDERS.len(),
         prop::collection::vec(demand, 3),
     )
-        .prop_map(|(entrances_m, inner_m, last_m, paths, crossings, exits, per_point, demands)| {
-            RawZone { entrances_m, inner_m, last_m, paths, crossings, exits, per_point, demands }
+        .prop_map(|(entrances_m, inner_m, last_m, paths, crossings, exits, order, demands)| RawZone {
+            entrances_m,
+            inner_m,
+            last_m,
+            paths,
+            crossings,
+            exits,
+            order,
+            demands,
         })
 }
 
@@ -238,7 +253,7 @@ impl RawNetwork {
 
     fn write_zone(&self, text: &mut String, roads: &mut String, all: &[Built], index: usize, zone: &Built) {
         let raw = &self.zones[index];
-        let order = if raw.per_point { "per_point" } else { "fifo" };
+        let order = ORDERS[raw.order % ORDERS.len()].1;
         *text += &format!("[[zones]]\nname = \"z{index}\"\norder = \"{order}\"\nsegments = [\n");
         for (at, (name, length_m)) in zone.segments.iter().enumerate().filter(|(at, _)| zone.is_used[*at]) {
             let source = match zone.sources.get(at) {
