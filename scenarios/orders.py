@@ -22,6 +22,10 @@ start until the last has left. Time is in all zones, from entry to exit of each;
 time at the entry speeds' mean; held are arrivals that had to wait outside, by the end nobody, and wait is how long on
 average over all vehicles. Infeasible are vehicles that met a QP without solution; bounded are commands the shield changed.
 
+Where queues grow `per_point` carries less than `fifo`, and more vehicles meet steps without solution: whoever comes to a point first is not
+whoever came to the zone first, and duties come up that were not there when a vehicle planned. While traffic is light at the
+roundabout it saves a little time. `fifo` is the default for that.
+
 """
 
 
@@ -79,7 +83,7 @@ def main():
         text += f"## {name}\n\n| rate [1/h] | order | " + " | ".join(c for c, _, _ in columns) + " |\n"
         text += "|---" * (len(columns) + 2) + "|\n"
         for rate in rates:
-            for order in ["fifo", "per_point"]:
+            for order in ["fifo", "per_point", "resequenced"]:
                 runs = [run(cz, name, rate, order, seed) for seed in SEEDS]
                 assert all(r["left"] == r["all"] for r in runs), "somebody has not left"
                 mean = lambda key: sum(r[key] for r in runs) / len(runs)
