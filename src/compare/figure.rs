@@ -56,18 +56,21 @@ fn draw<DB: DrawingBackend>(area: DrawingArea<DB, Shift>, scenario: &str, places
         let margin = 0.06 * (high - low).max(1e-3);
         low - margin..high + margin + room * (high - low).max(1e-3)
     };
+    let (times, energies) = (range(|p| p.time_s, 0.35), range(|p| p.energy, 0.1));
+    // Ten ticks or so that differ.
+    let decimals = |range: &std::ops::Range<f64>| if range.end - range.start < 1.0 { 2 } else { 1 };
     let mut chart = ChartBuilder::on(&area)
         .caption(format!("Time and energy per vehicle ({scenario})"), ("sans-serif", 20))
         .margin(12)
         .x_label_area_size(48)
         .y_label_area_size(64)
-        .build_cartesian_2d(range(|p| p.time_s, 0.35), range(|p| p.energy, 0.1))?;
+        .build_cartesian_2d(times.clone(), energies.clone())?;
     chart
         .configure_mesh()
         .x_desc("time per vehicle, with waits outside (s)")
         .y_desc("energy per vehicle (m²/s³)")
-        .x_label_formatter(&|v| format!("{v:.1}"))
-        .y_label_formatter(&|v| format!("{v:.1}"))
+        .x_label_formatter(&|v| format!("{v:.*}", decimals(&times)))
+        .y_label_formatter(&|v| format!("{v:.*}", decimals(&energies)))
         .axis_desc_style(AXIS_FONT)
         .label_style(LABEL_FONT)
         .light_line_style(WHITE)
