@@ -42,9 +42,8 @@ FIRST_SEED = 1000
 
 def seen(rows):
     """What a policy is given: features of about 1, from those of the environment."""
-    (present, _, x, v, _, remaining, in_zone, _, _, _, _, _) = numpy.moveaxis(rows[..., :12], -1, 0)
-    (has_ahead, ahead_m, ahead_mps, ahead_mps2) = numpy.moveaxis(rows[..., 12:16], -1, 0)
-    (has_merge, merge_m, merge_mps, merge_mps2, merge_in) = numpy.moveaxis(rows[..., 16:21], -1, 0)
+    present, _, x, v, _, remaining, in_zone, _, _, _, _, _, *partners = numpy.moveaxis(rows[..., :21], -1, 0)
+    has_ahead, ahead_m, ahead_mps, ahead_mps2, has_merge, merge_m, merge_mps, merge_mps2, merge_in = partners
     of_reaction = 1.0 - merge_in / LENGTH_M
     return numpy.stack(
         [

@@ -52,20 +52,24 @@ def features(zone: ZoneView) -> NDArray[numpy.float64]:
         "u_mps2": zone.u,
         "remaining_m": zone.length - x,
         "in_zone_s": zone.time - zone.entry_time,
+        "has_terminal": ~numpy.isnan(zone.terminal),
+        "terminal_mps": zone.terminal,
+        "has_schedule": ~numpy.isnan(zone.scheduled_at),
+        "scheduled_in_m": zone.scheduled_at - x,
+        "scheduled_in_s": zone.scheduled_time - zone.time,
+        "has_ahead": ~numpy.isnan(zone.ahead_x),
+        "ahead_m": zone.ahead_x - x,
+        "ahead_mps": zone.ahead_v - v,
+        "ahead_mps2": zone.ahead_u,
+        "has_merge": ~numpy.isnan(zone.merge_x),
+        "merge_m": zone.merge_x - x,
+        "merge_mps": zone.merge_v - v,
+        "merge_mps2": zone.merge_u,
+        "merge_in_m": zone.merge_at - x,
     }
-
-    def where_there_is(name: str, there: NDArray[numpy.bool_], values: dict[str, NDArray[numpy.float64]]) -> None:
-        columns[f"has_{name}"] = there
-        columns.update({key: numpy.where(there, value, 0.0) for key, value in values.items()})
-
-    where_there_is("terminal", ~numpy.isnan(zone.terminal), {"terminal_mps": zone.terminal})
-    scheduled = {"scheduled_in_m": zone.scheduled_at - x, "scheduled_in_s": zone.scheduled_time - zone.time}
-    where_there_is("schedule", ~numpy.isnan(zone.scheduled_at), scheduled)
-    ahead = {"ahead_m": zone.ahead_x - x, "ahead_mps": zone.ahead_v - v, "ahead_mps2": zone.ahead_u}
-    where_there_is("ahead", ~numpy.isnan(zone.ahead_x), ahead)
-    merge = {"merge_m": zone.merge_x - x, "merge_mps": zone.merge_v - v, "merge_mps2": zone.merge_u}
-    where_there_is("merge", ~numpy.isnan(zone.merge_x), {**merge, "merge_in_m": zone.merge_at - x})
     rows = numpy.zeros((len(zone), len(FEATURES)))
     for at, name in enumerate(FEATURES[:-1]):
         rows[:, at] = columns[name]
+    # Where there is nothing of the kind.
+    rows[numpy.isnan(rows)] = 0.0
     return rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import typing
 
 from . import _schemas as s
@@ -196,6 +197,7 @@ class ZoneView:
         self._partners = partners
         self._cache: dict[object, Floats] = {}
         self._partners_now: list[list[Partner]] | None = None
+        self._nearest_now: dict[str, list[Partner | None]] = {}
 
     def __len__(self) -> int:
         return len(self.commands)
@@ -334,14 +336,14 @@ class ZoneView:
         return self._partners_now
 
     def _nearest(self, kind: str, field: str) -> Floats:
-        def nearest() -> Floats:
+        found = self._nearest_now.get(kind)
+        if found is None:
             if kind == "ahead":
                 found = [min(_of(all_, True), key=_where, default=None) for all_ in self.partners]
             else:
                 found = [min(_of(all_, False), key=_where_met, default=None) for all_ in self.partners]
-            return _array([NAN if p is None else getattr(p, field) for p in found])
-
-        return self._once((kind, field), nearest)
+            self._nearest_now[kind] = found
+        return self._once((kind, field), lambda: _array([NAN if p is None else getattr(p, field) for p in found]))
 
 
 class Partner(typing.NamedTuple):
@@ -439,9 +441,15 @@ def structured(records: ctypes.Array[typing.Any]) -> typing.Any:
     """A ctypes array of records as a numpy structured array over the same memory, where there is numpy."""
     if numpy is None:
         return records
-    if not len(records):
-        return numpy.zeros(0, dtype=numpy.dtype(records._type_))
-    return numpy.ctypeslib.as_array(records)
+    dtype = _dtype(records._type_)
+    # Numpy cannot make an array of an empty buffer.
+    return numpy.frombuffer(records, dtype) if len(records) else numpy.zeros(0, dtype)
+
+
+@functools.lru_cache(maxsize=None)
+def _dtype(record: type[ctypes.Structure]) -> typing.Any:
+    """The type of a record in numpy, made once, as making it takes longer than a step may."""
+    return numpy.dtype(record)
 
 
 def frozen(values: typing.Any) -> typing.Any:
