@@ -234,7 +234,7 @@ impl Membership {
                 trace::note(|| format!("{name} has been replaced, generation {}", seat.generation));
                 arrived.push((peer, seat.generation));
                 if role == Role::Controller && plugins.on_exit(index).is_some() {
-                    if plugins.taken(index, seat.generation, seat.stands_in) {
+                    for _ in 0..plugins.taken(index, seat.generation, seat.stands_in) {
                         let text = format!("{name} is gone: another has taken its place");
                         events.say(step, RunEventKind::Exited, text, 1 << index);
                     }

@@ -68,6 +68,8 @@ struct Row {
     on_exit: OnExit,
     exits: u32,
     generation: u32,
+    /// Up to which generation, itself not among them, it is known that they have ended.
+    ended: u32,
     driven_by: DrivenBy,
     answer_ns: Histogram<u64>,
 }
@@ -79,6 +81,7 @@ impl PluginLog {
             on_exit: plugin.on_exit,
             exits: 0,
             generation: 0,
+            ended: 0,
             driven_by: DrivenBy::Plugin,
             answer_ns: super::new_histogram(),
         };
@@ -131,22 +134,28 @@ impl PluginLog {
     pub fn exited(&mut self, controller: u32) {
         if let Some(row) = self.row(controller) {
             row.exits += 1;
+            row.ended = row.generation + 1;
             if row.on_exit == OnExit::ShieldFallback {
                 row.driven_by = DrivenBy::ShieldFallback;
             }
         }
     }
 
-    /// Its place has been taken anew, by one of ours or not. Returns whether nobody had noticed that the process before
-    /// had ended, as happens while nobody is waited for.
-    pub fn taken(&mut self, controller: u32, generation: u32, stands_in: bool) -> bool {
-        let Some(row) = self.row(controller) else { return false };
-        // One of ours that is replaced is no end of the controller's.
-        let is_news = row.driven_by != DrivenBy::Builtin && row.exits < generation;
-        row.exits += u32::from(is_news);
+    /// Its place has been taken anew, by one of ours or not. Returns how many ends of the controller nobody had noticed:
+    /// of the process before, while nobody was waited for, and of those that had the place and died before they could begin.
+    pub fn taken(&mut self, controller: u32, generation: u32, stands_in: bool) -> u32 {
+        let Some(row) = self.row(controller) else { return 0 };
+        // That one of ours has ended is no end of the controller's.
+        let is_another = generation > row.generation;
+        let before =
+            u32::from(is_another && row.ended <= row.generation && row.driven_by != DrivenBy::Builtin);
+        let between =
+            if stands_in { 0 } else { generation.saturating_sub(row.ended.max(row.generation + 1)) };
+        row.exits += before + between;
         row.generation = generation;
+        row.ended = generation;
         row.driven_by = if stands_in { DrivenBy::Builtin } else { DrivenBy::Plugin };
-        is_news
+        before + between
     }
 
     /// What it has come to; `missed` says of each controller by its index how many deadlines it has missed.
@@ -185,14 +194,16 @@ mod tests {
         let mut log = PluginLog::new(&scenario, 1);
         let row = |log: &PluginLog| log.report(|_| 0).remove(0);
         log.exited(1);
-        assert!(!log.taken(1, 1, false), "that was noticed");
-        assert!(log.taken(1, 2, false), "nobody was waited for when it ended");
+        assert_eq!(log.taken(1, 1, false), 0, "that was noticed");
+        assert_eq!(log.taken(1, 2, false), 1, "nobody was waited for when it ended");
+        log.exited(1);
+        assert_eq!(log.taken(1, 5, false), 2, "two had the place before it, and could not begin");
         log.exited(1);
         let now = row(&log);
-        assert_eq!((now.exits, now.generation, now.driven_by), (3, 2, DrivenBy::Plugin));
-        assert!(!log.taken(1, 3, true) && !log.taken(1, 4, true), "one of ours was replaced");
-        assert_eq!((row(&log).exits, row(&log).driven_by), (3, DrivenBy::Builtin));
+        assert_eq!((now.exits, now.generation, now.driven_by), (6, 5, DrivenBy::Plugin));
+        assert_eq!(log.taken(1, 7, true) + log.taken(1, 8, true), 0, "ours were replaced");
+        assert_eq!((row(&log).exits, row(&log).driven_by), (6, DrivenBy::Builtin));
         // The pool's are none of them.
-        assert!(!log.taken(0, 7, false) && log.on_exit(0).is_none());
+        assert!(log.taken(0, 7, false) == 0 && log.on_exit(0).is_none());
     }
 }

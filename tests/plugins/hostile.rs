@@ -130,20 +130,20 @@ fn disturbed(policy: &str, seed: u64) -> String {
     }
 }
 
-/// `cargo test --test plugins -- --ignored --nocapture at_random`; `CZ_RUNS` changes the number of runs per policy,
-/// `CZ_POLICY` names one of them.
+/// `cargo test --test plugins -- --ignored --nocapture at_random`; `CZ_SEEDS` takes other seeds than 1-100, and
+/// `CZ_POLICY` one policy alone.
 #[test]
 #[ignore = "four hundred runs"]
 fn controllers_killed_and_slowed_at_random_are_told_of_and_recordings_replay() {
-    let runs = std::env::var("CZ_RUNS").ok().and_then(|runs| runs.parse().ok()).unwrap_or(100);
+    let seeds = crate::seeds();
     let only = std::env::var("CZ_POLICY").ok();
     let policies = ["wait", "hold", "shield-fallback", "abort"];
     for policy in policies.into_iter().filter(|policy| only.as_deref().is_none_or(|only| only == *policy)) {
         let mut tally = std::collections::BTreeMap::<String, u64>::new();
-        for seed in 1..=runs {
+        for seed in seeds.clone() {
             *tally.entry(disturbed(policy, seed)).or_default() += 1;
-            if seed.is_multiple_of(10) || seed == runs {
-                println!("--on-miss {policy}, {seed} runs: {tally:?}");
+            if seed.is_multiple_of(10) || seed == *seeds.end() {
+                println!("--on-miss {policy}, seeds {} to {seed}: {tally:?}", seeds.start());
             }
         }
     }

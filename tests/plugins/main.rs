@@ -11,6 +11,7 @@ mod hostile;
 mod sdks;
 mod tools;
 
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::process::Command;
 use std::sync::OnceLock;
@@ -81,6 +82,13 @@ fn installed() -> &'static Path {
         prefix
     });
     prefix.path()
+}
+
+/// Seeds of what is run many times by hand: `CZ_SEEDS=41-60`, 1 to 100 otherwise.
+fn seeds() -> RangeInclusive<u64> {
+    let Ok(seeds) = std::env::var("CZ_SEEDS") else { return 1..=100 };
+    let (first, last) = seeds.split_once('-').expect("CZ_SEEDS is FIRST-LAST");
+    first.parse().unwrap()..=last.parse().unwrap()
 }
 
 /// Compiles a controller in C or C++ as its author would: against what is installed, with the flags of the
