@@ -39,7 +39,7 @@ fn a_good_controller_passes() {
 }
 
 /// Mode, rule, step (a vehicle may come later than the fault sets in), and words of the diagnosis.
-const BROKEN: [(&str, &str, Option<u64>, &str); 24] = [
+const BROKEN: [(&str, &str, Option<u64>, &str); 25] = [
     ("nan", "finite", Some(120), "field u_mps2"),
     ("bad-intent", "finite", Some(120), "planned_exit_time_s"),
     ("out-of-range", "limits", Some(120), "is commanded 4.5 m/s^2, which is not within [-4, 4]"),
@@ -62,6 +62,7 @@ const BROKEN: [(&str, &str, Option<u64>, &str); 24] = [
     ("crash-at-start", "attach", Some(0), "SIGABRT"),
     ("crash-mid-run", "alive", Some(120), "SIGABRT"),
     ("leaves-mid-run", "alive", Some(120), "exit status: 0"),
+    ("takes-offence", "feedback", Some(501), "SIGABRT"),
     ("loses-track", "catch-up", None, "exit status: 1"),
     ("old-schema", "schema", Some(0), "build both from the same version"),
 ];

@@ -12,8 +12,12 @@ use control_zones::coordination::Coordinator;
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{EntryRule, Override, PassingOrder, Scenario, load};
 use control_zones::world::{ShieldRow, World};
-use ipc_schemas::{VehicleCommand, VehicleState};
+use ipc_schemas::{
+    Assignment, CONSTRAINT_CROSS, CONSTRAINT_MERGE, CONSTRAINT_REAR_END, NO_VEHICLE, ROW_CROSS, ROW_MERGE,
+    ROW_REAR_END, ROW_SPEED, RULE_NONE, STATE_LEFT, VehicleCommand, VehicleState,
+};
 use shares::assert_one_hash;
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 const VEHICLE_STEPS: u64 = 1_000_000;
@@ -297,6 +301,61 @@ fn withstands_leaders_that_stop_where_paths_cross() {
 }
 
 /// Under more demand than they carry: everybody gets through, whichever the order, and nobody touches.
+/// What a controller written elsewhere is told fits its commands, the states that follow, and the duties in force.
+#[test]
+fn rows_are_named_with_the_vehicle_toward_which_they_are() {
+    let set = "controllers=[{name=\"mine\", zones=[\"centre\"]}]".parse().unwrap();
+    let sets = ["shield=on".parse().unwrap(), "end.time_s=100".parse().unwrap(), set];
+    let scenario = Arc::new(load(Some("intersection"), &sets, Some(1)).unwrap());
+    let mut world = World::new(scenario.clone(), 1);
+    world.share_out(2);
+    let mut coordinator = Coordinator::new(scenario.clone(), 0..1);
+    let mut duties: Vec<Assignment> = Vec::new();
+    let mut told = BTreeMap::<String, u32>::new();
+    while !world.is_finished() {
+        let states: Vec<VehicleState> = world.records().collect();
+        for row in world.feedback() {
+            *told.entry(row.row_name()).or_default() += 1;
+            assert_eq!((row.controller, row.rule, row.step + 1), (1, RULE_NONE, world.step()), "{row}");
+            let after = states.iter().find(|s| s.vehicle == row.vehicle && s.flags & STATE_LEFT == 0);
+            assert!(row.greatest <= row.value && after.is_none_or(|s| s.u_mps2 <= row.greatest), "{row}");
+            let kinds: &[u16] = match row.row {
+                ROW_SPEED => &[],
+                // Behind a merge whoever passed it first is ahead.
+                ROW_REAR_END => &[CONSTRAINT_REAR_END, CONSTRAINT_MERGE],
+                ROW_MERGE => &[CONSTRAINT_MERGE],
+                ROW_CROSS => &[CONSTRAINT_CROSS],
+                _ => panic!("{row}"),
+            };
+            assert_eq!(row.toward == NO_VEHICLE, kinds.is_empty(), "{row}");
+            let is_owed = |a: &Assignment| {
+                (a.vehicle, a.partner) == (row.vehicle, row.toward) && kinds.contains(&a.kind)
+            };
+            assert!(kinds.is_empty() || duties.iter().any(is_owed), "{row}");
+        }
+        if world.coordinator_masks().acting != 0 {
+            coordinator.act(world.step(), &states);
+            duties = coordinator.assignments().to_vec();
+            world.coordinate(&duties);
+        }
+        let commanded = states.iter().filter(|s| s.is_commanded());
+        let all = commanded.map(|s| (s.vehicle, s.zone));
+        let commands = all.map(|(vehicle, zone)| VehicleCommand {
+            u_mps2: 4.0,
+            vehicle,
+            zone,
+            ..VehicleCommand::default()
+        });
+        world.command(0, &[]).unwrap();
+        world.command(1, &commands.collect::<Vec<_>>()).unwrap();
+        world.advance().unwrap();
+    }
+    println!("{told:?}");
+    for name in ["speed", "rear_end", "merge", "cross"] {
+        assert!(told.contains_key(name), "{name}: {told:?}");
+    }
+}
+
 #[test]
 fn traffic_never_locks_up() {
     for network in ["intersection", "roundabout", "lane-drop", "grid-3x3"] {

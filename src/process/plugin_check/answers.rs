@@ -1,6 +1,7 @@
 //! The controller's answers: waited for, judged, and replaced where they break a rule.
 
-use super::{BRAKE_FROM, BRAKE_TO, INDEX, Kit, PATIENCE, PAUSE_AT, Rule};
+use super::{BRAKE_FROM, BRAKE_TO, INDEX, Kit, PATIENCE, PAUSE_AT, Rule, TELL_FROM, TELL_TO};
+use crate::lockstep::Refusal;
 use crate::process::ProcessError;
 use crate::transport::iox::IoxFrame;
 use crate::transport::{Frame, Inbox};
@@ -25,6 +26,7 @@ impl Kit<'_> {
         let rule = match (step, substitute.is_empty()) {
             (PAUSE_AT, _) => Rule::Pause,
             (BRAKE_FROM..BRAKE_TO, _) => Rule::HardBraking,
+            (TELL_FROM..TELL_TO, _) => Rule::Feedback,
             (_, true) => Rule::EmptyZone,
             _ => Rule::Alive,
         };
@@ -39,7 +41,8 @@ impl Kit<'_> {
             }
             if waited.as_millis() >= 2 {
                 if let Some(how) = self.ended() {
-                    self.breach(Rule::Alive, how);
+                    let is_told = (TELL_FROM..TELL_TO).contains(&step);
+                    self.breach(if is_told { Rule::Feedback } else { Rule::Alive }, how);
                     return Ok(false);
                 }
                 std::thread::sleep(Duration::from_micros(50));
@@ -93,6 +96,7 @@ impl Kit<'_> {
                 HeaderFault::OtherCount { .. } => Rule::Count,
             };
             self.breach(rule, fault.to_string());
+            self.tell_refusal(&Refusal::Header(fault))?;
             records.clone_from(&substitute);
         }
         if let Err(fault) = self.world.command(INDEX, &records) {
@@ -108,6 +112,7 @@ impl Kit<'_> {
                 CommandFault::BadVerdict { .. } => Rule::Verdict,
             };
             self.breach(rule, fault.to_string());
+            self.tell_refusal(&Refusal::Command { step, fault })?;
             self.world.forget_commands();
             let mut all = substitute;
             std::mem::swap(&mut records, &mut all);
@@ -118,6 +123,8 @@ impl Kit<'_> {
             self.world.command(0, &own).expect("the built-in pool answers as it should");
             self.world.command(INDEX, &records).expect("the substitute is as it should be");
         }
+        self.tell_some_refusal(&records)?;
+        self.commanded = records;
         self.world.advance().expect("all vehicles have been commanded");
         Ok(())
     }

@@ -2,12 +2,13 @@
 //!
 //! World, coordinator and the built-in pool run in this process; only the controller under test is another
 //! one. The script: an empty zone at first, vehicles that come and go, a world that pauses, a leader that
-//! brakes to a stop, a restart in mid-run, steps that pass while the controller is stopped, and the end of the run. A bad frame is noted under the rule it
+//! brakes to a stop, all that a controller can be told of its answers, a restart in mid-run, steps that pass while the controller is stopped, and the end of the run. A bad frame is noted under the rule it
 //! breaks and replaced, so that one fault does not hide the others.
 
 mod answers;
 mod child;
 mod rules;
+mod told;
 
 pub use rules::{Breach, Report, Rule};
 
@@ -18,13 +19,13 @@ use super::{ProcessError, WaitMode};
 use crate::control::ControllerPool;
 use crate::coordination::Coordinator;
 use crate::lockstep::Handover;
-use crate::scenario::{Override, Scenario, ScenarioError, load_given};
+use crate::scenario::{Scenario, ScenarioError, load_given};
 use crate::transport::iox::{IoxInbox, IoxOutbox, RunName, RunSpace, ServiceLimits};
 use crate::transport::{Backlog, Frame, Inbox, Loan, Outbox};
 use crate::world::World;
 use hdrhistogram::Histogram;
 use ipc_schemas::{
-    self as frames, Assignment, FLAG_END_OF_RUN, FrameHeader, Role, VehicleCommand, VehicleState,
+    self as frames, Assignment, FLAG_END_OF_RUN, Feedback, FrameHeader, Role, VehicleCommand, VehicleState,
 };
 use rustix::process::Signal;
 use std::sync::Arc;
@@ -42,6 +43,9 @@ const JOIN: Duration = Duration::from_secs(15);
 const PAUSE_AT: u64 = 300;
 const BRAKE_FROM: u64 = 400;
 const BRAKE_TO: u64 = 460;
+/// Whatever can be said of answers is said meanwhile.
+const TELL_FROM: u64 = 500;
+const TELL_TO: u64 = 560;
 const RESTART_AT: u64 = 600;
 const STOP_AT: u64 = 750;
 const GO_ON_AT: u64 = 780;
@@ -54,8 +58,8 @@ const END_AT: u64 = 900;
 /// Where the script plays: behind a merge a junction, which the controller drives, with merges, a crossing, lanes
 /// that part, and several duties per vehicle.
 pub fn scenario() -> Result<Scenario, ScenarioError> {
-    let set: Override = format!("controllers=[{{name=\"{CONTROLLER}\", zones=[\"junction\"]}}]").parse()?;
-    load_given(include_str!("junction.toml"), Vec::new(), &[set], None)
+    let controllers = format!("controllers=[{{name=\"{CONTROLLER}\", zones=[\"junction\"]}}]");
+    load_given(include_str!("junction.toml"), Vec::new(), &[controllers.parse()?], None)
 }
 
 /// Checks a command line in a scenario with one plug-in, called [`CONTROLLER`].
@@ -74,8 +78,7 @@ pub fn check(
     let coordination = space.create(frames::SERVICE_COORDINATION, limits(1, 3))?;
     let commands = space.create(frames::SERVICE_COMMAND, limits(3, 1))?;
     let members = space.create(frames::SERVICE_MEMBERS, MembersOutbox::limits(3, 6))?;
-    // Held open, and silent: whatever is wrong stands in the report.
-    let _feedback = create_feedback(&space, INDEX)?;
+    let feedback = create_feedback(&space, INDEX)?;
     let run_id = 0x636f_6e66_6f72_6d00 | u64::from(std::process::id() & 0xff);
     let mut world = World::new(scenario.clone(), 1);
     world.share_out(INDEX + 1);
@@ -85,6 +88,7 @@ pub fn check(
         state: state.outbox(256)?,
         coordination: coordination.outbox(512)?,
         commands: commands.inbox()?,
+        feedback: feedback.outbox(16)?,
         members: MembersOutbox::open(&members, run_id)?,
         coordinator: Coordinator::new(scenario.clone(), zones.clone()),
         in_force: zones.clone().map(|_| Vec::new()).collect(),
@@ -96,6 +100,7 @@ pub fn check(
         latency_ns: Histogram::new(3).expect("three significant digits are valid"),
         breaches: Vec::new(),
         answered: 0,
+        commanded: Vec::new(),
         command,
         run: &run,
         child: None,
@@ -122,6 +127,7 @@ struct Kit<'a> {
     state: IoxOutbox<VehicleState>,
     coordination: IoxOutbox<Assignment>,
     commands: IoxInbox<VehicleCommand>,
+    feedback: IoxOutbox<Feedback>,
     members: MembersOutbox,
     coordinator: Coordinator,
     /// By zone.
@@ -133,6 +139,8 @@ struct Kit<'a> {
     latency_ns: Histogram<u64>,
     breaches: Vec<Breach>,
     answered: u64,
+    /// The controller's commands of the step before, as they were taken.
+    commanded: Vec<VehicleCommand>,
     command: &'a [String],
     run: &'a RunName,
     child: Option<PluginChild>,
@@ -154,6 +162,7 @@ impl Kit<'_> {
             Rule::Attach | Rule::Schema => true,
             Rule::Pause => step > PAUSE_AT,
             Rule::HardBraking => step >= BRAKE_TO,
+            Rule::Feedback => step > TELL_TO,
             Rule::Restart => step > RESTART_AT,
             Rule::CatchUp => step > GO_ON_AT,
             Rule::End => step >= END_AT,
@@ -248,6 +257,7 @@ impl Kit<'_> {
                 return Ok(false);
             }
             let substitute = self.substitute(states);
+            self.commanded.clear();
             self.world.command(INDEX, &substitute).expect("the substitute is as it should be");
             self.world.advance().expect("all vehicles have been commanded");
         }
@@ -258,6 +268,7 @@ impl Kit<'_> {
         let step = self.world.step();
         let masks = self.world.coordinator_masks();
         let header = self.header(Role::World, step);
+        self.tell_bounds(states)?;
         let sent = Instant::now();
         let header = FrameHeader { coordinators_acting: masks.acting, ..header };
         let fill = states.iter().copied();

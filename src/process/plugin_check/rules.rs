@@ -25,6 +25,7 @@ pub enum Rule {
     EmptyZone,
     Pause,
     HardBraking,
+    Feedback,
     Deadline,
     Alive,
     Restart,
@@ -34,7 +35,7 @@ pub enum Rule {
 
 impl Rule {
     /// All rules, in the order of the report.
-    pub const ALL: [Rule; 23] = [
+    pub const ALL: [Rule; 24] = [
         Rule::Attach,
         Rule::Schema,
         Rule::Run,
@@ -53,6 +54,7 @@ impl Rule {
         Rule::EmptyZone,
         Rule::Pause,
         Rule::HardBraking,
+        Rule::Feedback,
         Rule::Deadline,
         Rule::Alive,
         Rule::Restart,
@@ -81,6 +83,9 @@ impl Rule {
             Rule::EmptyZone => "answers steps without vehicles",
             Rule::Pause => "waits for a world that pauses",
             Rule::HardBraking => "goes on while a leader brakes to a stop",
+            Rule::Feedback => {
+                "goes on when it is told what bounded its commands, or that an answer was refused"
+            }
             Rule::Deadline => "answers within the deadline, but for one step in a hundred",
             Rule::Alive => "stays alive and answers every step",
             Rule::Restart => "joins again after being killed, and goes on from there",
