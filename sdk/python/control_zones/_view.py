@@ -441,9 +441,10 @@ def structured(records: ctypes.Array[typing.Any]) -> typing.Any:
     """A ctypes array of records as a numpy structured array over the same memory, where there is numpy."""
     if numpy is None:
         return records
-    dtype = _dtype(records._type_)
+    buffer: typing.Any = records
+    dtype = _dtype(buffer._type_)
     # Numpy cannot make an array of an empty buffer.
-    return numpy.frombuffer(records, dtype) if len(records) else numpy.zeros(0, dtype)
+    return numpy.frombuffer(buffer, dtype) if len(records) else numpy.zeros(0, dtype)
 
 
 @functools.lru_cache(maxsize=None)
