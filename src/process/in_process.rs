@@ -39,25 +39,16 @@ pub fn run_in_process_observed(
 
 /// Runs one that has been begun to its end.
 pub fn run_on_in_process(
-    mut run: InProcess,
+    run: InProcess,
     stop: &StopFlag,
     progress: impl FnMut(&World),
 ) -> Result<Outcome, ProcessError> {
-    drive(&mut run, stop, progress, |_| {})
+    run_on_in_process_observed(run, stop, progress, |_| {})
 }
 
 /// The same of one that is observed, and shows the frames of every step.
 pub fn run_on_in_process_observed(
     mut run: InProcess,
-    stop: &StopFlag,
-    progress: impl FnMut(&World),
-    observe: impl FnMut(&StepFrames<'_>),
-) -> Result<Outcome, ProcessError> {
-    drive(&mut run, stop, progress, observe)
-}
-
-fn drive(
-    run: &mut InProcess,
     stop: &StopFlag,
     mut progress: impl FnMut(&World),
     mut observe: impl FnMut(&StepFrames<'_>),
