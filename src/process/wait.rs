@@ -134,14 +134,14 @@ impl Manner {
     }
 }
 
-/// Whether more processes than this want to run; not where the system does not tell.
-fn more_run_than(room: usize) -> bool {
+/// Whether more processes than this want to run, where the system tells.
+fn more_run_than(room: usize) -> Option<bool> {
     // See proc(5): the fourth field is those that run or wait to run, a slash, and all there are.
     let mut text = [0; 64];
     let length = std::fs::File::open("/proc/loadavg").and_then(|mut file| file.read(&mut text)).unwrap_or(0);
     let load = std::str::from_utf8(&text[..length]).unwrap_or_default();
-    let runnable = load.split_whitespace().nth(3).and_then(|field| field.split('/').next()?.parse().ok());
-    runnable.is_some_and(|runnable: usize| runnable > room)
+    let runnable: usize = load.split_whitespace().nth(3)?.split('/').next()?.parse().ok()?;
+    Some(runnable > room)
 }
 
 /// A driver of a participant.
@@ -273,9 +273,16 @@ impl Waiter {
                     }
                 }
                 Manner::Learned(policy, room) => {
-                    let room = *room;
-                    policy
-                        .look(now, gives_way, || Cores { idle_ns: idle_ns(), are_full: more_run_than(room) })
+                    let (room, was_crowded) = (*room, policy.is_crowded());
+                    let cores = || Cores { idle_ns: idle_ns(), are_full: more_run_than(room) };
+                    let advice = policy.look(now, gives_way, cores);
+                    if policy.is_crowded() != was_crowded {
+                        trace::note(|| {
+                            let wanted = if was_crowded { "cores are free" } else { "others want the cores" };
+                            wanted.to_owned()
+                        });
+                    }
+                    advice
                 }
             });
         }

@@ -10,8 +10,10 @@
 //! waiter sleeps at once for some waits, more each time; where it pays, for fewer.
 //!
 //! A core is crowded when a spinning waiter finds a hole in its own time, or a yield takes as long as others'
-//! turns do: one such turn costs as much as a thousand steps; and at first when more processes want to run than there
-//! is room for. Before it is taken to be free again, the cores must have
+//! turns do, and more processes want to run than there is room for: one such turn costs as much as a thousand steps. A
+//! hole while nobody wants to run is the system's, or that of the machine this one is a guest of, and says nothing of the
+//! next step. At first it is crowded when more want to run than there is room for: that may be a program that is just
+//! ending, so it is asked again soon, and after ever longer. Once that has gone on for long the cores must have
 //! had idle time, which they have among waiters that sleep, and have not beside work that never ends.
 //!
 //! Times are nanoseconds on one clock, and are given; so the policy can be tested without waiting.
@@ -32,8 +34,8 @@ pub(super) enum Advice {
 pub(super) struct Cores {
     /// How long they have been idle so far, in all.
     pub idle_ns: u64,
-    /// More processes want to run than there are cores, and this run may want.
-    pub are_full: bool,
+    /// More processes want to run than there are cores, and this run may want; `None` where the system does not tell.
+    pub are_full: Option<bool>,
 }
 
 /// What is known of a waiter's situation from the start.
@@ -107,10 +109,13 @@ const TURN: u64 = 500 * US;
 const WAKE_COST: u64 = 20 * US;
 const LEAST_WAKE_COST: u64 = 4 * US;
 const GREATEST_WAKE_COST: u64 = 100 * US;
-/// How long a core is taken for crowded after it was seen to be, at least and at most. Idle time is told in units of
-/// 10 ms.
-const LEAST_HOLD: u64 = 100 * MS;
+/// How long a core is taken for crowded after it was seen to be, at least and at most.
+const LEAST_HOLD: u64 = MS;
 const GREATEST_HOLD: u64 = 2_000 * MS;
+/// After this long idle time says whether it still is; it is told in units of 10 ms.
+const IDLE_HOLD: u64 = 100 * MS;
+/// A crowd that is back within this time, and four times as long as it was taken to be there, is here to stay.
+const BACK: u64 = 50 * MS;
 /// The cores are free when together they have been idle for more than the time that has passed, by this.
 const IDLE_SHARE: u64 = 8;
 /// Polling in vain so many times in a row on a free core makes sleep come at once.
@@ -131,6 +136,11 @@ impl WaitPolicy {
         }
     }
 
+    /// Whether others are taken to want the cores.
+    pub(super) fn is_crowded(&self) -> bool {
+        self.crowd.is_there
+    }
+
     /// Whether a wait that begins now begins with spinning.
     pub(super) fn begins_spinning(&self, gives_way: bool) -> bool {
         !gives_way && !self.situation.shares_cores && self.sleeps_left == 0
@@ -149,11 +159,14 @@ impl WaitPolicy {
             came_late: false,
         });
         let away = now.saturating_sub(wait.last_look);
-        match wait.last {
-            Advice::Spin if away > HOLE => self.crowd.seen(now, &cores),
-            Advice::Yield if away > TURN => self.crowd.seen(now, &cores),
-            Advice::Yield if away > SHARED && !self.needs_core(wait.gives_way) => wait.slept = true,
-            _ => {}
+        let longest = match wait.last {
+            Advice::Spin => HOLE,
+            Advice::Yield => TURN,
+            Advice::Sleep => u64::MAX,
+        };
+        let was_turn = away > longest && self.crowd.is_seen(now, &cores);
+        if wait.last == Advice::Yield && away > SHARED && !was_turn && !self.needs_core(wait.gives_way) {
+            wait.slept = true;
         }
         let is_crowded = self.crowd.is_there(now, &cores);
         let advice = self.advise(&mut wait, now, gives_way, is_crowded);
@@ -236,33 +249,45 @@ impl WaitPolicy {
 }
 
 impl Crowd {
-    fn seen(&mut self, now: u64, cores: impl Fn() -> Cores) {
+    /// Somebody had the core for as long as others' turns take: whether it is one who will want it again.
+    fn is_seen(&mut self, now: u64, cores: impl Fn() -> Cores) -> bool {
         if !self.is_there {
-            // Back soon after it was taken to be gone: it is here to stay.
-            let soon = now < self.until + 4 * self.hold_ns;
-            self.hold_ns =
-                if soon && self.until > 0 { (2 * self.hold_ns).min(GREATEST_HOLD) } else { LEAST_HOLD };
-            (self.asked, self.idle_ns) = (Some(now), cores().idle_ns);
+            let cores = cores();
+            if cores.are_full == Some(false) {
+                return false;
+            }
+            let is_back = self.until > 0 && now < self.until + 4 * self.hold_ns + BACK;
+            self.hold_ns = if is_back { (2 * self.hold_ns).min(GREATEST_HOLD) } else { LEAST_HOLD };
+            self.is_there_since(now, &cores);
         }
-        self.is_there = true;
+        self.until = now + self.hold_ns;
+        true
+    }
+
+    fn is_there_since(&mut self, now: u64, cores: &Cores) {
+        (self.asked, self.idle_ns, self.is_there) = (Some(now), cores.idle_ns, true);
         self.until = now + self.hold_ns;
     }
 
     fn is_there(&mut self, now: u64, cores: impl Fn() -> Cores) -> bool {
         let Some(asked) = self.asked else {
             // Nothing is known yet: whoever spins from the beginning loses turns before it learns better.
-            let Cores { idle_ns, are_full } = cores();
-            (self.asked, self.idle_ns, self.is_there) = (Some(now), idle_ns, are_full);
-            self.until = if are_full { now + self.hold_ns } else { 0 };
-            return are_full;
+            let cores = cores();
+            self.asked = Some(now);
+            if cores.are_full == Some(true) {
+                self.is_there_since(now, &cores);
+            }
+            return self.is_there;
         };
         if self.is_there && now >= self.until {
-            let idle_ns = cores().idle_ns;
-            let idle_since_ns = idle_ns.saturating_sub(self.idle_ns);
-            self.is_there = idle_since_ns < (now - asked) / IDLE_SHARE;
+            let cores = cores();
+            self.is_there = match cores.are_full {
+                Some(are_full) if self.hold_ns < IDLE_HOLD => are_full,
+                _ => cores.idle_ns.saturating_sub(self.idle_ns) < (now - asked) / IDLE_SHARE,
+            };
             if self.is_there {
-                (self.asked, self.idle_ns) = (Some(now), idle_ns);
-                self.until = now + self.hold_ns;
+                self.hold_ns = self.hold_ns.max((2 * self.hold_ns).min(IDLE_HOLD));
+                self.is_there_since(now, &cores);
             }
         }
         self.is_there
@@ -301,7 +326,7 @@ mod tests {
         fn look(&mut self, gives_way: bool) -> Advice {
             // A core is idle for half of the time, or never.
             let idle_ns = if self.is_busy { 0 } else { self.now / 2 };
-            self.policy.look(self.now, gives_way, || Cores { idle_ns, are_full: self.is_busy })
+            self.policy.look(self.now, gives_way, || Cores { idle_ns, are_full: Some(self.is_busy) })
         }
 
         /// A wait for a frame that comes after `ns`; polls are 1 us apart, yields take as long as `turn`.
@@ -330,11 +355,13 @@ mod tests {
             cost
         }
 
-        /// The waiter loses its core for so long while it spins.
+        /// The waiter loses its core for so long while it spins, to one who wants it again.
         fn is_preempted(&mut self, ns: u64) {
             assert_eq!(self.look(false), Advice::Spin);
             self.now += ns;
+            let is_busy = std::mem::replace(&mut self.is_busy, true);
             self.look(false);
+            self.is_busy = is_busy;
             let now = self.now;
             self.policy.came(|| now);
         }
@@ -411,22 +438,69 @@ mod tests {
     fn a_crowd_is_gone_once_nobody_wants_to_run_and_lasts_longer_when_it_comes_back() {
         let mut scene = Scene::new(ALONE, false);
         scene.is_preempted(3 * MS);
-        assert_eq!(scene.wait(MS, true, US).sleeps, 1, "it is crowded");
+        assert_eq!(scene.wait(100 * US, true, US).sleeps, 1, "it is crowded");
         let mut holds = Vec::new();
-        for _ in 0..8 {
+        for _ in 0..12 {
             let seen = scene.policy.crowd.until - scene.policy.crowd.hold_ns;
-            while scene.wait(MS, true, US).sleeps > 0 {}
+            while scene.wait(100 * US, true, US).sleeps > 0 {}
             holds.push(scene.now - seen);
             scene.is_preempted(3 * MS);
         }
-        assert!(holds[0] < 2 * LEAST_HOLD && holds.windows(2).all(|h| h[1] + 3 * MS > h[0]), "{holds:?}");
-        assert!((GREATEST_HOLD..GREATEST_HOLD + 10 * MS).contains(&holds[7]), "{holds:?}");
+        assert!(holds[0] < 2 * LEAST_HOLD && holds.windows(2).all(|h| h[1] + MS > h[0]), "{holds:?}");
+        assert!((GREATEST_HOLD..GREATEST_HOLD + 10 * MS).contains(&holds[11]), "{holds:?}");
         // While no core has idle time, it is not tried at all.
         scene.is_busy = true;
         let until = scene.now + 10 * GREATEST_HOLD;
         while scene.now < until {
             assert_eq!(scene.wait(MS, true, US).yields, 0);
         }
+    }
+
+    #[test]
+    fn a_hole_while_nobody_else_wants_to_run_is_no_crowd() {
+        let mut scene = Scene::new(ALONE, false);
+        assert_eq!(scene.look(false), Advice::Spin);
+        scene.now += MS;
+        assert_eq!(scene.look(false), Advice::Yield, "it has waited for long, on a core of its own");
+        let now = scene.now;
+        scene.policy.came(|| now);
+        // Such a yield took long because somebody ran in it, and it was no turn of others.
+        assert_eq!(scene.wait(MS, false, 600 * US).sleeps, 1);
+        scene.wait(US, false, US);
+        assert_eq!(scene.wait(100 * US, true, US).sleeps, 0);
+    }
+
+    #[test]
+    fn who_finds_the_cores_full_at_first_asks_again_soon_and_then_after_ever_longer() {
+        let mut scene = Scene::new(ALONE, true);
+        assert_eq!(scene.wait(100 * US, true, US).sleeps, 1);
+        scene.is_busy = false;
+        let begun = scene.now;
+        while scene.wait(100 * US, true, US).sleeps > 0 {}
+        assert!(scene.now - begun < 2 * LEAST_HOLD, "{:?}", scene.policy);
+
+        let mut scene = Scene::new(ALONE, true);
+        let until = scene.now + 400 * MS;
+        let mut asked = std::collections::BTreeSet::new();
+        while scene.now < until {
+            scene.wait(100 * US, true, US);
+            asked.insert(scene.policy.crowd.asked);
+        }
+        assert!((8..14).contains(&asked.len()), "{asked:?}");
+    }
+
+    #[test]
+    fn where_the_system_does_not_tell_who_wants_to_run_holes_and_idle_time_say_it() {
+        let mut policy = WaitPolicy::new(ALONE);
+        let idle_ns = std::cell::Cell::new(0);
+        let mut look = |now| policy.look(now, true, || Cores { idle_ns: idle_ns.get(), are_full: None });
+        assert_eq!(look(3_600_000 * MS), Advice::Yield);
+        assert_eq!(look(3_600_001 * MS), Advice::Sleep, "a turn of others");
+        assert_eq!(look(3_600_003 * MS), Advice::Sleep, "no core has been idle");
+        idle_ns.set(100 * MS);
+        policy.came(|| 3_600_004 * MS);
+        let cores = || Cores { idle_ns: 100 * MS, are_full: None };
+        assert_eq!(policy.look(3_600_010 * MS, true, cores), Advice::Yield);
     }
 
     #[test]
@@ -453,6 +527,7 @@ mod tests {
         assert!(!scene.policy.begins_spinning(false));
         assert_eq!(scene.wait(50 * US, false, 10 * US), Cost { polled_ns: 50 * US, yields: 5, sleeps: 0 });
         // Somebody else's turn.
+        scene.is_busy = true;
         scene.wait(4 * MS, false, 3 * MS);
         assert_eq!(scene.wait(50 * US, false, 10 * US), Cost { sleeps: 1, ..Cost::default() });
     }
