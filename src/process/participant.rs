@@ -153,6 +153,7 @@ impl<'a> Joined<'a> {
         let waiter = match self.role {
             Role::Controller => {
                 let coordinators = attachment.reply.coordinators;
+                let waiter = waiter.apart(self.role, attachment.reply.index);
                 waiter.waking(coordinator_ropes(&attachment.bells, self.wait, coordinators))
             }
             _ => waiter,

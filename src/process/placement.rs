@@ -1,7 +1,7 @@
 //! On which cores the processes of a run are.
 
 use ipc_schemas::Role;
-use rustix::thread::{CpuSet, sched_getaffinity, sched_setaffinity};
+use rustix::thread::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
 use std::io::Read;
 use std::sync::OnceLock;
 
@@ -58,14 +58,24 @@ pub fn place(placement: Placement, role: Role, index: u32) -> Option<usize> {
 /// Puts the calling thread where [`place`] would pin it, and leaves it free to go: the system would find a good
 /// place for it too, after as long as a short run takes.
 pub(super) fn begin_apart(role: Role, index: u32) {
+    if let Some(core) = core_of(role, index) {
+        go_to(core);
+    }
+}
+
+/// Takes the calling thread to a core, if it may use it, and leaves it free to go; does nothing when it is there.
+pub(super) fn go_to(core: usize) {
+    if sched_getcpu() == core {
+        return;
+    }
     let Some(free) = Affinity::current() else { return };
-    if core_of(role, index).and_then(move_to).is_some() {
+    if core < CpuSet::MAX_CPU && free.0.is_set(core) && move_to(core).is_some() {
         free.restore();
     }
 }
 
 /// The core of such a process.
-fn core_of(role: Role, index: u32) -> Option<usize> {
+pub(super) fn core_of(role: Role, index: u32) -> Option<usize> {
     match (role, &cores()[..]) {
         (_, []) => None,
         (Role::World, [first, ..]) | (_, [first]) => Some(*first),

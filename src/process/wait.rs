@@ -1,6 +1,6 @@
 //! How a process waits for a frame: busily at first, then asleep, never for ever.
 
-use super::placement::{cores_online, idle_ns, number_of_cores};
+use super::placement::{core_of, cores_online, go_to, idle_ns, number_of_cores};
 use super::realtime::{Breather, is_fifo};
 use super::wait_policy::{Advice, Cores, Situation, WaitPolicy};
 use super::{Peers, ProcessError, StopFlag};
@@ -10,6 +10,7 @@ use crate::scenario::ControllerNames;
 use crate::trace::{self, Phase};
 use crate::transport::iox::{Bell, BellRope, monotonic_ns};
 use ipc_schemas::{Role, WAITING_ADAPTIVE, WAITING_BLOCK, WAITING_HYBRID, WAITING_SPIN};
+use rustix::thread::sched_getcpu;
 use std::io::Read;
 use std::time::{Duration, Instant};
 
@@ -67,6 +68,8 @@ impl WaitMode {
 #[derive(Debug)]
 pub struct Patience {
     manner: Manner,
+    /// Who is woken goes to the core that is given away to it.
+    follows: bool,
     /// A frame that takes longer ends the run.
     timeout: Duration,
 }
@@ -113,7 +116,10 @@ impl Patience {
             WaitMode::Hybrid => Manner::Fixed { spin: SPIN, busy },
             WaitMode::Spin => Manner::Fixed { spin: Duration::MAX, busy: Duration::MAX },
         };
-        Patience { manner, timeout }
+        // Controllers that wake a coordinator give their core away until it has answered. On another it would have to
+        // interrupt whoever is there, most likely the world, which spins.
+        let follows = mode == WaitMode::Adaptive && role == Role::Coordinator;
+        Patience { manner, follows, timeout }
     }
 }
 
@@ -173,6 +179,12 @@ pub struct Waiter {
     first: Option<Duration>,
     waited: Duration,
     peers_checked: Duration,
+    /// The core that is this process's among those of the run, where it goes when it finds a peer on its own.
+    home: Option<usize>,
+    /// Another core, which whoever has woken it has given away to it.
+    given: Option<usize>,
+    /// When it last went to another core, ns on the monotonic clock.
+    moved_ns: u64,
     /// There is one when the process would keep others from running.
     breather: Option<Breather>,
 }
@@ -181,6 +193,8 @@ pub struct Waiter {
 const POLLS_PER_LOOK: u64 = 32;
 /// How long a peer that has left the services may take to end.
 const LEAVING: Duration = Duration::from_millis(200);
+/// How often a process goes to another core, at most, ns: where the system takes it away there is nothing to be gained.
+const MOVE_EVERY_NS: u64 = 2_000_000;
 /// How often the peers are checked during a long wait.
 const PEER_CHECK: Duration = Duration::from_millis(10);
 
@@ -201,6 +215,9 @@ impl Waiter {
             first: None,
             waited: Duration::ZERO,
             peers_checked: Duration::ZERO,
+            home: None,
+            given: None,
+            moved_ns: 0,
             breather: Breather::if_needed(),
         }
     }
@@ -208,6 +225,12 @@ impl Waiter {
     /// Has the first wait be bounded so.
     pub fn begin_within(mut self, bound: Duration) -> Waiter {
         self.first = Some(bound);
+        self
+    }
+
+    /// Goes to the core of this process, unless it is there, when it finds a peer on its own.
+    pub fn apart(mut self, role: Role, index: u32) -> Waiter {
+        self.home = core_of(role, index);
         self
     }
 
@@ -219,8 +242,17 @@ impl Waiter {
 
     /// Wakes the coordinators of this mask that sleep.
     pub fn wake(&self, mask: u64) {
-        let meant = self.coordinators.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1);
-        meant.for_each(|(_, rope)| rope.ring());
+        self.coordinators_of(mask).for_each(BellRope::ring);
+    }
+
+    /// The same, before this process gives its core away to them.
+    fn give_way_to(&self, mask: u64) {
+        self.coordinators_of(mask).for_each(BellRope::ring_and_give_way);
+    }
+
+    fn coordinators_of(&self, mask: u64) -> impl Iterator<Item = &BellRope> {
+        let all = self.coordinators.iter().enumerate();
+        all.filter(move |(i, _)| mask >> i & 1 == 1).map(|(_, rope)| rope)
     }
 
     /// Something came.
@@ -233,8 +265,12 @@ impl Waiter {
             return;
         }
         self.advice = None;
-        if let Manner::Learned(policy, _) = &mut self.patience.manner {
-            policy.came(monotonic_ns);
+        if let Manner::Learned(policy, _) = &mut self.patience.manner
+            && policy.came(monotonic_ns)
+            && let Some(home) = self.home
+            && self.may_move()
+        {
+            go_to(home);
         }
         if self.since.take().is_none() {
             // Nobody has so much as looked at the clock.
@@ -274,7 +310,11 @@ impl Waiter {
                 }
                 Manner::Learned(policy, room) => {
                     let (room, was_crowded) = (*room, policy.is_crowded());
-                    let cores = || Cores { idle_ns: idle_ns(), are_full: more_run_than(room) };
+                    let cores = || {
+                        // Coordinators that are awake want to run as well.
+                        let awake = self.coordinators.iter().filter(|rope| !rope.is_asleep()).count();
+                        Cores { idle_ns: idle_ns(), are_full: more_run_than(room + awake) }
+                    };
                     let advice = policy.look(now, gives_way, cores);
                     if policy.is_crowded() != was_crowded {
                         trace::note(|| {
@@ -303,16 +343,35 @@ impl Waiter {
         };
         if !self.lies_down {
             // What came before it did has been looked for in vain once more when this is called again.
+            if let Some(core) = self.given.take() {
+                // It has done what it was woken for.
+                go_to(core);
+            }
             self.lies_down = true;
             bell.lie_down();
             return;
         }
         self.lies_down = false;
-        let rung_at = bell.sleep(bound(BELL_NAP));
+        let ring = bell.sleep(bound(BELL_NAP));
         if let Manner::Learned(policy, _) = &mut self.patience.manner {
-            policy.slept(monotonic_ns(), rung_at);
+            policy.slept(monotonic_ns(), ring.map(|ring| ring.at_ns));
+        }
+        let core = ring.and_then(|ring| ring.core).filter(|core| sched_getcpu() != *core);
+        if core.is_some() && self.patience.follows && self.may_move() {
+            self.given = core;
         }
     }
+
+    /// Whether it has not been to another core for some time.
+    fn may_move(&mut self) -> bool {
+        let now = monotonic_ns();
+        let may = now.saturating_sub(self.moved_ns) >= MOVE_EVERY_NS;
+        if may {
+            self.moved_ns = now;
+        }
+        may
+    }
+
     /// Looks at the signals, the clock and the peers; returns what the clock says, ns.
     fn look(&mut self, awaited: Awaited) -> Result<u64, ProcessError> {
         if self.stop.is_set() {
@@ -369,7 +428,7 @@ impl Waiter {
                     trace::begin(Phase::Wait, awaited.step);
                     // About to give its core away: now they are woken at the least cost.
                     if self.polls == 0 && awaited.role == Role::Coordinator {
-                        self.wake(awaited.missing);
+                        self.give_way_to(awaited.missing);
                     }
                     self.wait(awaited, None)?;
                 }

@@ -2,7 +2,8 @@
 //!
 //! Spinning gets a frame at once and keeps a core; sleeping gives the core away and costs a wake-up. Alone on its
 //! core a waiter may poll for as long as it likes; it yields now and then, and if a yield takes a while, the peer
-//! it waits for was on this very core: it sleeps once, for who is woken goes to a free core.
+//! it waits for was on this very core: it is to go to its own core, and sleeps once, for who is woken goes to a free
+//! one; but not with every kernel that has few of them.
 //!
 //! On a *crowded* core, where processes of others want to run, it spins for as long as being woken takes and then
 //! sleeps: that costs at most twice what knowing the future would (the ski-rental rule), and two processes that
@@ -226,9 +227,13 @@ impl WaitPolicy {
         wait.came_late = waited > if self.crowd.is_there { self.wake_cost_ns } else { BUSY };
     }
 
-    /// The frame has come, after polling for it at least once. `now` is asked for the time where it matters.
-    pub(super) fn came(&mut self, now: impl FnOnce() -> u64) {
-        let Some(wait) = self.wait.take() else { return self.polling_paid() };
+    /// The frame has come, after polling for it at least once; returns whether from this very core, where it was not
+    /// expected. `now` is asked for the time where it matters.
+    pub(super) fn came(&mut self, now: impl FnOnce() -> u64) -> bool {
+        let Some(wait) = self.wait.take() else {
+            self.polling_paid();
+            return false;
+        };
         if wait.slept_at_once {
             // While frames come late there is nothing to be tried.
             if !wait.came_late || self.sleeps_left > 1 {
@@ -237,9 +242,12 @@ impl WaitPolicy {
         } else if !wait.slept {
             self.polling_paid();
             let yielded = wait.last == Advice::Yield && !self.needs_core(wait.gives_way);
-            // Where it came from this very core, the next wait begins with sleep, and ends on a free one.
-            self.sleeps_left = u32::from(yielded && now() - wait.last_look > SHARED);
+            let was_here = yielded && now() - wait.last_look > SHARED;
+            // The next wait begins with sleep, and ends on a free core.
+            self.sleeps_left = u32::from(was_here);
+            return was_here;
         }
+        false
     }
 
     fn polling_paid(&mut self) {
@@ -306,6 +314,8 @@ mod tests {
         now: u64,
         is_busy: bool,
         wake_ns: u64,
+        /// The frame of the last wait came from this core.
+        was_here: bool,
     }
 
     /// What a wait cost: time spent polling, and wake-ups.
@@ -320,7 +330,7 @@ mod tests {
         fn new(situation: Situation, is_busy: bool) -> Scene {
             let policy = WaitPolicy::new(situation);
             // Not at the clock's origin, where no machine ever is.
-            Scene { policy, now: 3_600_000 * MS, is_busy, wake_ns: 10 * US }
+            Scene { policy, now: 3_600_000 * MS, is_busy, wake_ns: 10 * US, was_here: false }
         }
 
         fn look(&mut self, gives_way: bool) -> Advice {
@@ -351,7 +361,7 @@ mod tests {
                 cost.polled_ns += self.now - begun;
             }
             let now = self.now;
-            self.policy.came(|| now);
+            self.was_here = self.policy.came(|| now);
             cost
         }
 
@@ -509,7 +519,9 @@ mod tests {
         scene.wait(US, false, US);
         // The peer runs in the yield, and answers.
         assert_eq!(scene.wait(SPIN + US, false, 40 * US).yields, 1);
+        assert!(scene.was_here);
         assert_eq!(scene.wait(SPIN + US, false, 40 * US).sleeps, 1);
+        assert!(!scene.was_here);
         assert_eq!(scene.wait(US, false, US), Cost { polled_ns: US, ..Cost::default() });
         // It runs in the yield, and has not answered yet.
         let cost = scene.wait(MS, false, 40 * US);

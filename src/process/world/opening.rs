@@ -128,6 +128,7 @@ impl Opened {
         }
         let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
         let waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
+        let waiter = waiter.apart(Role::World, 0);
         let mut waiter = waiter.waking(coordinator_ropes(&bells, wait, coordinators));
         waiter.call(driver.names());
         for (role, index, seat) in reception.seats() {

@@ -13,7 +13,7 @@
 use crate::scenario::share::{MAX_CONTROLLERS, MAX_COORDINATORS};
 use ipc_schemas::Role;
 use memmap2::MmapRaw;
-use rustix::thread::futex;
+use rustix::thread::{futex, sched_getcpu};
 use rustix::time::{ClockId, Timespec, clock_gettime};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::rc::Rc;
@@ -23,6 +23,15 @@ use std::time::Duration;
 /// The bells of a run, mapped by this process.
 #[derive(Clone, Debug)]
 pub struct Bells(Rc<MmapRaw>);
+
+/// The ring that ended a sleep. Whoever may write to the file may have made it up.
+#[derive(Clone, Copy, Debug)]
+pub struct Ring {
+    /// When, ns on the [monotonic clock](monotonic_ns).
+    pub at_ns: u64,
+    /// The core to go to, which whoever rang is about to give away.
+    pub core: Option<usize>,
+}
 
 /// The sleeper's end.
 #[derive(Debug)]
@@ -48,6 +57,8 @@ const ASLEEP: u32 = 1;
 const CELL_BYTES: usize = 128;
 /// Where in a cell the instant of the last ring is.
 const RUNG_AT: usize = 8;
+/// Where in a cell the core is that is given away to the sleeper, and one; or 0.
+const GIVEN: usize = 16;
 /// The world, and room for as many others as there may be.
 const CELLS: usize = 1 + (MAX_COORDINATORS + MAX_CONTROLLERS) as usize;
 /// Size of the file.
@@ -116,6 +127,11 @@ impl Cell {
         unsafe { AtomicU32::from_ptr(self.map.as_mut_ptr().add(self.offset).cast()) }
     }
 
+    fn given(&self) -> &AtomicU32 {
+        // SAFETY: as for `word`; 16 bytes further on in the same cell.
+        unsafe { AtomicU32::from_ptr(self.map.as_mut_ptr().add(self.offset + GIVEN).cast()) }
+    }
+
     fn rung_at(&self) -> &AtomicU64 {
         // SAFETY: as for `word`; 8 bytes further on in the same cell, and aligned to 8.
         unsafe { AtomicU64::from_ptr(self.map.as_mut_ptr().add(self.offset + RUNG_AT).cast()) }
@@ -131,14 +147,17 @@ impl Bell {
     }
 
     /// Sleeps until the bell rings, or has rung since [`lie_down`](Self::lie_down), or the time is up. Returns
-    /// when it was rung, ns on the [monotonic clock](monotonic_ns), if it was.
-    pub fn sleep(&self, at_most: Duration) -> Option<u64> {
+    /// the ring, if there was one.
+    pub fn sleep(&self, at_most: Duration) -> Option<Ring> {
         let at_most =
             Timespec { tv_sec: at_most.as_secs() as i64, tv_nsec: i64::from(at_most.subsec_nanos()) };
         // However it ends, whoever called looks again.
         let _ = futex::wait(self.0.word(), futex::Flags::empty(), ASLEEP, Some(&at_most));
         let was_rung = self.0.word().swap(AWAKE, Ordering::Acquire) == AWAKE;
-        was_rung.then(|| self.0.rung_at().load(Ordering::Relaxed))
+        was_rung.then(|| Ring {
+            at_ns: self.0.rung_at().load(Ordering::Relaxed),
+            core: self.0.given().load(Ordering::Relaxed).checked_sub(1).map(|core| core as usize),
+        })
     }
 
     /// Takes [`lie_down`](Self::lie_down) back.
@@ -157,15 +176,22 @@ impl BellRope {
     /// `ring_all`.
     pub fn ring(&self) {
         fence(Ordering::SeqCst);
-        self.ring_after_fence();
+        self.ring_after_fence(|| 0);
     }
 
-    fn ring_after_fence(&self) {
+    /// The same from one who is about to give its core away, and for it to the sleeper.
+    pub fn ring_and_give_way(&self) {
+        fence(Ordering::SeqCst);
+        self.ring_after_fence(|| sched_getcpu() as u32 + 1);
+    }
+
+    fn ring_after_fence(&self, given: impl Fn() -> u32) {
         let word = self.0.word();
         if word.load(Ordering::Relaxed) == AWAKE {
             return;
         }
         self.0.rung_at().store(monotonic_ns(), Ordering::Relaxed);
+        self.0.given().store(given(), Ordering::Relaxed);
         // Of several ringers one makes the call.
         if word.swap(AWAKE, Ordering::Release) != AWAKE {
             let _ = futex::wake(word, futex::Flags::empty(), 1);
@@ -177,7 +203,7 @@ impl BellRope {
 pub fn ring_all(ropes: &[BellRope]) {
     if !ropes.is_empty() {
         fence(Ordering::SeqCst);
-        ropes.iter().for_each(BellRope::ring_after_fence);
+        ropes.iter().for_each(|rope| rope.ring_after_fence(|| 0));
     }
 }
 
@@ -203,16 +229,21 @@ mod tests {
         let other = theirs.rope(Role::Controller, 0);
         bell.lie_down();
         other.ring();
-        assert_eq!(bell.sleep(Duration::from_millis(1)), None, "it was another's bell");
+        assert!(bell.sleep(Duration::from_millis(1)).is_none(), "it was another's bell");
         bell.lie_down();
         let before = monotonic_ns();
         rope.ring();
-        let rung = bell.sleep(LONG).expect("it was rung before it slept");
-        assert!((before..=monotonic_ns()).contains(&rung));
+        let ring = bell.sleep(LONG).expect("it was rung before it slept");
+        assert!((before..=monotonic_ns()).contains(&ring.at_ns));
+        assert_eq!(ring.core, None);
+        bell.lie_down();
+        rope.ring_and_give_way();
+        let core = bell.sleep(LONG).and_then(|ring| ring.core).expect("a core was given away");
+        assert!(rustix::thread::sched_getaffinity(None).expect("the system tells").is_set(core));
         // A ring nobody sleeps through leaves nothing behind.
         rope.ring();
         bell.lie_down();
-        assert_eq!(bell.sleep(Duration::from_millis(1)), None);
+        assert!(bell.sleep(Duration::from_millis(1)).is_none());
     }
 
     /// A ball goes to and fro between two sleepers who never spin. Would a single ring be lost, it would lie

@@ -10,7 +10,7 @@ mod ports;
 mod space;
 mod watchdog;
 
-pub use bell::{Bell, BellRope, Bells, monotonic_ns};
+pub use bell::{Bell, BellRope, Bells, Ring, monotonic_ns};
 pub use blocks::{Block, BlockInbox, BlockOutbox, SteeringInbox, SteeringOutbox};
 pub use error::SpaceError;
 pub use leftovers::{Condition, Leftover, clean, sweep_dead_runs};
