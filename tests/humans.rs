@@ -93,6 +93,35 @@ fn everybody_gets_through() {
     }
 }
 
+/// Humans who go by their own right of way do not start into one that comes, and sort out by sight who goes first when two
+/// have entered at the same instant; and an automated vehicle that stands at its line lets one pass that drives. Each of
+/// these runs of the penetration study had bodies that overlapped, or duties that began outside the safe set.
+#[test]
+fn nobody_starts_into_another() {
+    for (automated, seed) in
+        [(0.0, 4), (0.0, 5), (0.1, 13), (0.3, 9), (0.4, 5), (0.5, 8), (0.6, 13), (0.7, 13), (0.8, 9)]
+    {
+        let human = "driver=\"human\", yields=\"priority\", desired_mps=13, desired_sd_mps=1";
+        let sets = [
+            "shield=on".to_owned(),
+            "gate.entry=viable".to_owned(),
+            "control.law=viable".to_owned(),
+            "coordination.schedule=tandem".to_owned(),
+            "coordination.order=resequenced".to_owned(),
+            format!("fleet=[{{name=\"automated\"}}, {{name=\"human\", {human}}}]"),
+            format!("roads.*.automated={automated}"),
+            "roads.0.rank=1".to_owned(),
+            "end.vehicles=100".to_owned(),
+        ];
+        let sets: Vec<Override> = sets.iter().map(|s| s.parse().unwrap()).collect();
+        let summary = built_in(&Arc::new(load_embedded("intersection", &sets, Some(seed)).unwrap()));
+        let row = &summary.shield.controllers[0];
+        let what = format!("{automated}, seed {seed}: {:?}", summary.overlaps);
+        assert_eq!((summary.departed, summary.waiting), (100, 0), "{what}");
+        assert_eq!((summary.overlaps.pairs, row.began_unsafe, row.lost), (0, 0, 0), "{what}");
+    }
+}
+
 /// Drives the automated ones with an adversary until so many steps of vehicles, humans and others, have passed.
 fn attack(
     scenario: &Arc<Scenario>,

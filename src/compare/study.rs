@@ -216,7 +216,7 @@ const MEASURES: [Measure; 15] = [
     measure("pet", "PET < 2 s", 1, Pool::Mean, |s| per_hundred(s, s.counts.pet)),
     measure("overlaps", "overlaps", 0, Pool::Sum, |s| Some(s.sample.overlap_pairs as f64)),
     measure("rear_end_m", "rear end, m", 2, Pool::Least, |s| least(s, 0)),
-    measure("merge_m", "merge, m", 2, Pool::Least, |s| least(s, 1)),
+    measure("merge_m", "merge or crossing, m", 2, Pool::Least, |s| least(s, 1)),
     measure("cross_m", "crossing, m", 2, Pool::Least, |s| s.least_cross_m),
     measure("lost", "lost", 0, Pool::Sum, |s| Some(s.lost as f64)),
     measure("began_unsafe", "began unsafe", 0, Pool::Sum, |s| Some(s.began_unsafe as f64)),

@@ -8,7 +8,7 @@ use super::assign::{Assigner, row};
 use super::schedule::{Scene, Scheduler};
 use crate::conflict::{Conflicts, Duties, Row, can_yield, has_gone_first, is_in_the_way, stands_on};
 use crate::scenario::{HumanParams, PassingOrder, Scenario, VehicleKind, VehicleParams};
-use crate::shield::{RESERVE_M, Shield, yielding_slack_m};
+use crate::shield::{Shield, VIABLE_FROM_M, yielding_slack_m};
 use ipc_schemas::{STATE_ENTERED, STATE_HUMAN, STATE_WAITS, VehicleState};
 
 /// A vehicle that lets a newcomer pass first keeps at least this much slack, m: it is not to brake hard for it.
@@ -233,7 +233,7 @@ impl Orders {
         if b.is_free {
             return is_human(first);
         }
-        self.slack_m(conflicts, second, &a, &b) >= RESERVE_M
+        self.slack_m(conflicts, second, &a, &b) >= VIABLE_FROM_M
             || is_human(first) && has_gone_first(conflicts, &a, &b)
     }
 

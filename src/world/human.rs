@@ -21,6 +21,10 @@ const STANDING_MPS: f64 = 0.3;
 const DRIVING_MPS: f64 = 3.0;
 /// A speed with which nobody is expected sooner than never, m/s.
 const CREEPING_MPS: f64 = 0.1;
+/// Whoever is seen to brake harder than this means to stop, m/s^2.
+const BRAKING_MPS2: f64 = 0.5;
+/// Time that whoever starts gives those that come to notice it: until it moves, and their reaction, s.
+const LOOKING_S: f64 = 1.0;
 /// Between errors of one driver's acceleration, s.
 const NOISE_S: f64 = 1.0;
 /// How long one brakes for no reason, s.
@@ -315,19 +319,50 @@ impl Scene<'_> {
         }
         let clears_s = reach_s(own_m + clear_m, car.v_mps, desired_mps, human.acceleration_mps2);
         // Whoever has the way may make use of it from now on.
-        let comes_s = match has_way || is_inside {
+        let counts_on_it = has_way || is_inside && other_box_m > 0.0;
+        let comes_s = match counts_on_it {
             true => other_m / other.v_mps.max(CREEPING_MPS),
             false => reach_s(other_m, other.v_mps, desired_mps, human.acceleration_mps2),
         };
+        let is_patient = waited_s < human.patience_s || other.v_mps >= STANDING_MPS;
+        let drives = other.v_mps >= STANDING_MPS && other.u_mps2 > -BRAKING_MPS2;
+        if is_inside && other_box_m <= 0.0 {
+            // Both have entered, at the same instant perhaps. What the other does is to be seen: nobody drives on into one that
+            // does, whoever has the way; and of two that stand the one that has it goes, or whom the other is in the way of.
+            return match has_way {
+                true => drives && comes_s < clears_s,
+                false => {
+                    is_patient
+                        && comes_s < clears_s + human.critical_gap_s
+                        && !self.stands_in_the_way(car, other)
+                }
+            };
+        }
+        if has_way && !is_inside && drives && car.v_mps < DRIVING_MPS {
+            // Whoever has stood looks before it starts whether those that show no sign of stopping still can without haste.
+            let stops_m =
+                other.v_mps * LOOKING_S + other.v_mps * other.v_mps / (2.0 * human.comfortable_mps2);
+            return stops_m > other_box_m && comes_s < clears_s;
+        }
         let braking_mps2 = -self.kinds[usize::from(other.kind)].u_min_mps2;
         let stops_by_m = if other_box_m > 0.0 { other_box_m } else { other_m };
         let stops = other.v_mps * other.v_mps / (2.0 * braking_mps2) <= stops_by_m;
-        if has_way || is_inside {
+        if counts_on_it {
             // Nobody insists on it toward one that cannot stop any more.
             return !stops && comes_s < clears_s;
         }
-        let is_patient = waited_s < human.patience_s || other.v_mps >= STANDING_MPS;
         comes_s - clears_s < human.critical_gap_s && is_patient
+    }
+
+    /// Whether a vehicle is on a conflict point that another has yet to pass.
+    fn stands_in_the_way(&self, car: &Car, other: &Car) -> bool {
+        let length_m = self.kinds[usize::from(car.kind)].length_m;
+        self.conflicts.uses(car.path).iter().any(|own| {
+            let to_m = own.at_m + clear_m(&self.conflicts.points()[own.point as usize], length_m);
+            let theirs = self.conflicts.uses(other.path).iter().find(|u| u.point == own.point);
+            (own.at_m..to_m).contains(&car.x_m)
+                && theirs.is_some_and(|theirs| !theirs.on_lane_of(own) && other.x_m < theirs.at_m)
+        })
     }
 }
 

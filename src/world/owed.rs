@@ -4,7 +4,7 @@ use super::car::Car;
 use super::role::World;
 use crate::conflict::{Conflicts, Duties, Duty, DutyKind, Row, can_yield, has_gone_first, stands_on};
 use crate::scenario::{PassingOrder, Scenario, VehicleParams, Zone, ZoneId};
-use crate::shield::{Partner, RESERVE_M, Shield, yielding_slack_m};
+use crate::shield::{Partner, Shield, VIABLE_FROM_M, yielding_slack_m};
 use crate::vehicle::Held;
 use ipc_schemas::Assignment;
 
@@ -154,7 +154,7 @@ impl World {
                         (_, true) => {}
                     }
                     let shield = Shield::new(&self.kinds[usize::from(second.kind)], scenario.dt_s());
-                    yielding_slack_m(&shield, conflicts, duties, &row(first), &row(second)) >= RESERVE_M
+                    yielding_slack_m(&shield, conflicts, duties, &row(first), &row(second)) >= VIABLE_FROM_M
                 })
             });
         if is_safe {
