@@ -34,9 +34,9 @@ SETS = (
     "end.time_s=1000",
 )
 RATES = {"two-merges": 300, "roundabout": 250}
-RULES = {"two-merges": "priority", "intersection": "allway_stop", "roundabout": "priority"}
+RULE = "priority"
 #: And SUMO's other ways to rule the same junction, where nobody is automated.
-OTHERS = {"two-merges": ["zipper", "traffic_light"], "intersection": ["traffic_light"], "roundabout": ["zipper", "traffic_light"]}
+OTHERS = {"two-merges": ["zipper", "traffic_light"], "intersection": ["allway_stop", "traffic_light"], "roundabout": ["zipper", "traffic_light"]}
 
 
 class Run(typing.NamedTuple):
@@ -206,8 +206,8 @@ def figure(rules: dict[str, dict[float, list[Found]]]) -> str:
 
 def main(args: argparse.Namespace) -> None:
     """Makes the runs, prints the tables, and writes what is asked for."""
-    names = args.scenario or ["two-merges", "roundabout"]
-    series = [(name, rule, args.shares) for name in names for rule in args.rules or [RULES.get(name, "priority")]]
+    names = args.scenario or ["two-merges", "intersection", "roundabout"]
+    series = [(name, rule, args.shares) for name in names for rule in args.rules or [RULE]]
     if args.rules is None:
         series += [(name, rule, [0.0]) for name in names for rule in OTHERS.get(name, [])]
     runs = [Run(name, rule, share, seed) for name, rule, shares in series for share in shares for seed in args.seeds]

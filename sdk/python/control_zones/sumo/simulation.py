@@ -24,6 +24,8 @@ except ImportError as error:
 
 #: Speeds are ours alone: none of SUMO's checks of distance, acceleration, right of way, red lights or limits.
 OURS = 32 + 64
+#: Not into whoever is ahead, but through a junction without asking for the right of way: neither of those who come nor of those within.
+THROUGH = 1 + 2 + 4 + 32
 #: What SUMO does by itself, of speeds and of lanes.
 SUMOS, SUMOS_LANES = 31, 1621
 #: Lane changes: none.
@@ -98,13 +100,13 @@ class Simulation:
             v_mps = 0.0
         libsumo.vehicle.setSpeed(car.name, v_mps)
 
-    def release(self, car: Car) -> None:
-        """Leaves a vehicle to SUMO's own driver."""
+    def release(self, car: Car, mode: int = SUMOS) -> None:
+        """Leaves a vehicle to SUMO's own driver, with these of its checks."""
         if car.is_driven:
             car.is_driven = False
             if car.name not in self.gone:
                 libsumo.vehicle.setSpeed(car.name, -1.0)
-                libsumo.vehicle.setSpeedMode(car.name, SUMOS)
+                libsumo.vehicle.setSpeedMode(car.name, mode)
                 libsumo.vehicle.setLaneChangeMode(car.name, SUMOS_LANES)
 
     def see(self, car: Car) -> None:
