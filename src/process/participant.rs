@@ -1,6 +1,6 @@
 //! The coordinator and controller processes.
 
-use super::services::{controller_ropes, coordinator_ropes, expected_vehicles, rope_of};
+use super::services::{controller_ropes, coordinator_ropes, expected_vehicles, rope_of, ropes_of_others};
 use super::wait::Participant;
 use super::{Attachment, Held, Joining, Patience, ProcessError, Settling, StopFlag, WaitMode, Waiter};
 use crate::control::ControllerPool;
@@ -153,7 +153,13 @@ impl<'a> Joined<'a> {
         let waiter = match self.role {
             Role::Controller => {
                 let coordinators = attachment.reply.coordinators;
-                let waiter = waiter.apart(self.role, attachment.reply.index);
+                let (reply, own) = (&attachment.reply, (self.role, attachment.reply.index));
+                let waiter = waiter.apart(own.0, own.1).among(ropes_of_others(
+                    &attachment.bells,
+                    reply.coordinators,
+                    reply.controllers,
+                    own,
+                ));
                 waiter.waking(coordinator_ropes(&attachment.bells, self.wait, coordinators))
             }
             _ => waiter,

@@ -222,6 +222,18 @@ pub(super) fn coordinator_ropes(bells: &Bells, wait: WaitMode, coordinators: u32
     (0..count).map(|i| bells.rope(Role::Coordinator, i)).collect()
 }
 
+/// The ropes of all bells of a run but this process's own.
+pub(super) fn ropes_of_others(
+    bells: &Bells,
+    coordinators: u32,
+    controllers: u32,
+    own: (Role, u32),
+) -> Vec<BellRope> {
+    let counts = [(Role::World, 1), (Role::Coordinator, coordinators), (Role::Controller, controllers)];
+    let all = counts.into_iter().flat_map(|(role, count)| (0..count).map(move |index| (role, index)));
+    all.filter(|other| *other != own).map(|(role, index)| bells.rope(role, index)).collect()
+}
+
 /// The rope of one process's bell, when those of its role sleep under this mode.
 pub(super) fn rope_of(bells: &Bells, wait: WaitMode, role: Role, index: u32) -> Option<BellRope> {
     wait.has_bell(role).then(|| bells.rope(role, index))

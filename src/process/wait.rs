@@ -84,7 +84,7 @@ enum Manner {
         /// Time after which yielding ends too and sleeping begins.
         busy: Duration,
     },
-    /// As experience tells; where more processes than this want to run, somebody else does.
+    /// As experience tells, in a run of that many processes that wait busily.
     Learned(WaitPolicy, usize),
 }
 
@@ -107,10 +107,9 @@ impl Patience {
         let manner = match mode {
             WaitMode::Block => Manner::ASLEEP,
             WaitMode::Adaptive | WaitMode::Hybrid if role == Role::Coordinator => Manner::ASLEEP,
-            WaitMode::Adaptive => Manner::Learned(
-                WaitPolicy::new(Situation { shares_cores, may_yield }),
-                hot_processes.max(cores_online()),
-            ),
+            WaitMode::Adaptive => {
+                Manner::Learned(WaitPolicy::new(Situation { shares_cores, may_yield }), hot_processes)
+            }
             // More spinners than cores would only keep each other from working.
             WaitMode::Hybrid if shares_cores => Manner::Fixed { spin: Duration::ZERO, busy },
             WaitMode::Hybrid => Manner::Fixed { spin: SPIN, busy },
@@ -134,20 +133,35 @@ impl Manner {
         }
     }
 
-    /// Whether the time each yield takes says something.
-    fn times_yields(&self) -> bool {
-        matches!(self, Manner::Learned(..))
+    /// Whether others are taken to want the cores.
+    fn is_crowded(&self) -> bool {
+        matches!(self, Manner::Learned(policy, _) if policy.is_crowded())
+    }
+
+    /// How many yields there are to a look: the time that one takes may say something.
+    fn yields_per_look(&self) -> u64 {
+        match self {
+            Manner::Fixed { .. } => POLLS_PER_LOOK,
+            Manner::Learned(policy, _) if policy.expects_company() => YIELDS_PER_LOOK,
+            Manner::Learned(..) => 1,
+        }
     }
 }
 
-/// Whether more processes than this want to run, where the system tells.
-fn more_run_than(room: usize) -> Option<bool> {
+/// How many processes run or want to, where the system tells.
+fn runnable() -> Option<usize> {
     // See proc(5): the fourth field is those that run or wait to run, a slash, and all there are.
     let mut text = [0; 64];
     let length = std::fs::File::open("/proc/loadavg").and_then(|mut file| file.read(&mut text)).unwrap_or(0);
     let load = std::str::from_utf8(&text[..length]).unwrap_or_default();
-    let runnable: usize = load.split_whitespace().nth(3)?.split('/').next()?.parse().ok()?;
-    Some(runnable > room)
+    load.split_whitespace().nth(3)?.split('/').next()?.parse().ok()
+}
+
+/// Whether the cores are too few for others and for those of this run that wait busily, with so many processes that want
+/// to run, this one and so many others of this run among them.
+fn are_full(runnable: usize, own_awake: usize, hot_processes: usize, cores: usize) -> bool {
+    let others = runnable.saturating_sub(1 + own_awake);
+    others > 0 && others + hot_processes > cores
 }
 
 /// A driver of a participant.
@@ -165,6 +179,8 @@ pub struct Waiter {
     bell: Option<Bell>,
     /// The bells of coordinators, by index.
     coordinators: Vec<BellRope>,
+    /// Those of all other processes of the run.
+    others: Vec<BellRope>,
     /// What to do until the next look; nothing is known yet at the beginning of a wait.
     advice: Option<Advice>,
     /// The bell has been told that this process is about to sleep.
@@ -191,6 +207,8 @@ pub struct Waiter {
 
 /// How often the clock is read while polling busily: reading it costs about as much as a poll.
 const POLLS_PER_LOOK: u64 = 32;
+/// The same while yielding where peers run in every yield: together these take less than a turn of others.
+const YIELDS_PER_LOOK: u64 = 4;
 /// How long a peer that has left the services may take to end.
 const LEAVING: Duration = Duration::from_millis(200);
 /// How often a process goes to another core, at most, ns: where the system takes it away there is nothing to be gained.
@@ -205,6 +223,7 @@ impl Waiter {
             patience,
             bell,
             coordinators: Vec::new(),
+            others: Vec::new(),
             advice: None,
             lies_down: false,
             stop,
@@ -231,6 +250,12 @@ impl Waiter {
     /// Goes to the core of this process, unless it is there, when it finds a peer on its own.
     pub fn apart(mut self, role: Role, index: u32) -> Waiter {
         self.home = core_of(role, index);
+        self
+    }
+
+    /// Tells others' processes from those of this run, whose bells these are.
+    pub fn among(mut self, others: Vec<BellRope>) -> Waiter {
+        self.others = others;
         self
     }
 
@@ -267,6 +292,7 @@ impl Waiter {
         self.advice = None;
         if let Manner::Learned(policy, _) = &mut self.patience.manner
             && policy.came(monotonic_ns)
+            && !policy.is_crowded()
             && let Some(home) = self.home
             && self.may_move()
         {
@@ -293,7 +319,7 @@ impl Waiter {
         let is_time = match self.advice {
             None => !self.patience.manner.begins_spinning(gives_way),
             Some(Advice::Spin) => false,
-            Some(Advice::Yield) => self.patience.manner.times_yields(),
+            Some(Advice::Yield) => self.polls.is_multiple_of(self.patience.manner.yields_per_look()),
             Some(Advice::Sleep) => true,
         };
         if is_time || self.polls.is_multiple_of(POLLS_PER_LOOK) {
@@ -308,12 +334,16 @@ impl Waiter {
                         _ => Advice::Sleep,
                     }
                 }
-                Manner::Learned(policy, room) => {
-                    let (room, was_crowded) = (*room, policy.is_crowded());
+                Manner::Learned(policy, hot_processes) => {
+                    let (hot_processes, was_crowded) = (*hot_processes, policy.is_crowded());
+                    let awake = || self.others.iter().filter(|rope| !rope.is_asleep()).count();
                     let cores = || {
-                        // Coordinators that are awake want to run as well.
-                        let awake = self.coordinators.iter().filter(|rope| !rope.is_asleep()).count();
-                        Cores { idle_ns: idle_ns(), are_full: more_run_than(room + awake) }
+                        // One that has fallen asleep or was woken in the meantime was not counted as running, perhaps.
+                        let (before, runnable) = (awake(), runnable());
+                        let own_awake = awake().min(before);
+                        let are_full =
+                            runnable.map(|all| are_full(all, own_awake, hot_processes, cores_online()));
+                        Cores { idle_ns: idle_ns(), are_full }
                     };
                     let advice = policy.look(now, gives_way, cores);
                     if policy.is_crowded() != was_crowded {
@@ -428,7 +458,11 @@ impl Waiter {
                     trace::begin(Phase::Wait, awaited.step);
                     // About to give its core away: now they are woken at the least cost.
                     if self.polls == 0 && awaited.role == Role::Coordinator {
-                        self.give_way_to(awaited.missing);
+                        match self.patience.manner.is_crowded() {
+                            // There they wait for others' turns on whatever core they go to.
+                            true => self.wake(awaited.missing),
+                            false => self.give_way_to(awaited.missing),
+                        }
                     }
                     self.wait(awaited, None)?;
                 }
@@ -456,5 +490,26 @@ impl Waiter {
             }
             std::thread::sleep(NAP);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_cores_are_full_when_others_and_the_busy_of_this_run_are_more_than_there_are() {
+        // World and controller on two cores; both run, and a coordinator.
+        assert!(!are_full(3, 2, 2, 2));
+        assert!(!are_full(1, 0, 2, 2));
+        // One of somebody else's, while the controller sleeps or not.
+        assert!(are_full(2, 0, 2, 2));
+        assert!(are_full(3, 1, 2, 2));
+        // There is a core for it.
+        assert!(!are_full(3, 1, 2, 4));
+        // Alone, however many wait busily.
+        assert!(!are_full(9, 8, 5, 2));
+        // Asleep by now, who was counted as running.
+        assert!(!are_full(1, 3, 2, 2));
     }
 }

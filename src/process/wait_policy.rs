@@ -15,7 +15,8 @@
 //! hole while nobody wants to run is the system's, or that of the machine this one is a guest of, and says nothing of the
 //! next step. At first it is crowded when more want to run than there is room for: that may be a program that is just
 //! ending, so it is asked again soon, and after ever longer. Once that has gone on for long the cores must have
-//! had idle time, which they have among waiters that sleep, and have not beside work that never ends.
+//! had idle time, which they have among waiters that sleep, and have not beside work that never ends. Where this run
+//! alone has more processes that wait busily than there are cores, their number says nothing, and turns and idle time do.
 //!
 //! Times are nanoseconds on one clock, and are given; so the policy can be tested without waiting.
 
@@ -88,6 +89,8 @@ struct Crowd {
     /// When the idle time of the cores was asked for last, and what it was.
     asked: Option<u64>,
     idle_ns: u64,
+    /// How many processes want to run says whether others do.
+    numbers_tell: bool,
 }
 
 const US: u64 = 1_000;
@@ -129,7 +132,14 @@ impl WaitPolicy {
         WaitPolicy {
             situation,
             wake_cost_ns: WAKE_COST,
-            crowd: Crowd { until: 0, hold_ns: LEAST_HOLD, is_there: false, asked: None, idle_ns: 0 },
+            crowd: Crowd {
+                until: 0,
+                hold_ns: LEAST_HOLD,
+                is_there: false,
+                asked: None,
+                idle_ns: 0,
+                numbers_tell: !situation.shares_cores,
+            },
             in_vain: 0,
             sleeps_left: 0,
             sleeps: 1,
@@ -140,6 +150,11 @@ impl WaitPolicy {
     /// Whether others are taken to want the cores.
     pub(super) fn is_crowded(&self) -> bool {
         self.crowd.is_there
+    }
+
+    /// Whether peers are expected to run when this process yields.
+    pub(super) fn expects_company(&self) -> bool {
+        self.situation.shares_cores
     }
 
     /// Whether a wait that begins now begins with spinning.
@@ -261,11 +276,13 @@ impl Crowd {
     fn is_seen(&mut self, now: u64, cores: impl Fn() -> Cores) -> bool {
         if !self.is_there {
             let cores = cores();
-            if cores.are_full == Some(false) {
+            let are_full = cores.are_full.filter(|_| self.numbers_tell);
+            if are_full == Some(false) {
                 return false;
             }
+            let least = if are_full.is_some() { LEAST_HOLD } else { IDLE_HOLD };
             let is_back = self.until > 0 && now < self.until + 4 * self.hold_ns + BACK;
-            self.hold_ns = if is_back { (2 * self.hold_ns).min(GREATEST_HOLD) } else { LEAST_HOLD };
+            self.hold_ns = if is_back { (2 * self.hold_ns).min(GREATEST_HOLD) } else { least };
             self.is_there_since(now, &cores);
         }
         self.until = now + self.hold_ns;
@@ -290,7 +307,7 @@ impl Crowd {
         if self.is_there && now >= self.until {
             let cores = cores();
             self.is_there = match cores.are_full {
-                Some(are_full) if self.hold_ns < IDLE_HOLD => are_full,
+                Some(are_full) if self.numbers_tell && self.hold_ns < IDLE_HOLD => are_full,
                 _ => cores.idle_ns.saturating_sub(self.idle_ns) < (now - asked) / IDLE_SHARE,
             };
             if self.is_there {
@@ -506,11 +523,11 @@ mod tests {
         let mut look = |now| policy.look(now, true, || Cores { idle_ns: idle_ns.get(), are_full: None });
         assert_eq!(look(3_600_000 * MS), Advice::Yield);
         assert_eq!(look(3_600_001 * MS), Advice::Sleep, "a turn of others");
-        assert_eq!(look(3_600_003 * MS), Advice::Sleep, "no core has been idle");
+        assert_eq!(look(3_600_150 * MS), Advice::Sleep, "no core has been idle");
         idle_ns.set(100 * MS);
-        policy.came(|| 3_600_004 * MS);
+        policy.came(|| 3_600_160 * MS);
         let cores = || Cores { idle_ns: 100 * MS, are_full: None };
-        assert_eq!(policy.look(3_600_010 * MS, true, cores), Advice::Yield);
+        assert_eq!(policy.look(3_600_260 * MS, true, cores), Advice::Yield);
     }
 
     #[test]
@@ -539,7 +556,6 @@ mod tests {
         assert!(!scene.policy.begins_spinning(false));
         assert_eq!(scene.wait(50 * US, false, 10 * US), Cost { polled_ns: 50 * US, yields: 5, sleeps: 0 });
         // Somebody else's turn.
-        scene.is_busy = true;
         scene.wait(4 * MS, false, 3 * MS);
         assert_eq!(scene.wait(50 * US, false, 10 * US), Cost { sleeps: 1, ..Cost::default() });
     }

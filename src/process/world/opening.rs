@@ -10,7 +10,7 @@ use crate::process::outcome::Events;
 use crate::process::pace::Pacer;
 use crate::process::peers::is_alive;
 use crate::process::plugin_log::PluginLog;
-use crate::process::services::{Driver, Services, coordinator_ropes, expected_vehicles};
+use crate::process::services::{Driver, Services, coordinator_ropes, expected_vehicles, ropes_of_others};
 use crate::process::viewing::Viewing;
 use crate::process::{Patience, ProcessError, StopFlag, Waiter};
 use crate::record::{FileSource, Processes, Reader, ReplayError, replay_world};
@@ -128,7 +128,8 @@ impl Opened {
         }
         let patience = Patience::of(wait, Role::World, 1 + controllers as usize, options.peer_timeout);
         let waiter = Waiter::new(patience, bell, stop.clone(), reception.peers());
-        let waiter = waiter.apart(Role::World, 0);
+        let others = ropes_of_others(&bells, coordinators, controllers, (Role::World, 0));
+        let waiter = waiter.apart(Role::World, 0).among(others);
         let mut waiter = waiter.waking(coordinator_ropes(&bells, wait, coordinators));
         waiter.call(driver.names());
         for (role, index, seat) in reception.seats() {
