@@ -372,11 +372,11 @@ impl Waiter {
             return;
         };
         if !self.lies_down {
-            // What came before it did has been looked for in vain once more when this is called again.
             if let Some(core) = self.given.take() {
                 // It has done what it was woken for.
                 go_to(core);
             }
+            // What came before it did has been looked for in vain once more when this is called again.
             self.lies_down = true;
             bell.lie_down();
             return;
