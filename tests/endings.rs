@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{ENDLESS, Process, TestRun, children, example, is_alive, send, wait_until};
+use common::{ENDLESS, Process, TestRun, children, example, is_alive, send, wait_until, wait_until_stepping};
 use rustix::process::Signal;
 use std::process::Stdio;
 use std::time::Duration;
@@ -189,6 +189,8 @@ fn a_run_waits_for_those_a_killed_supervisor_of_its_name_has_left() {
     let test_run = TestRun::new("heir");
     let (supervisor, parts) = common::begin(&test_run, &ENDLESS, 3);
     let world = common::part(&parts, "world");
+    // Before, it may not be in the run yet, and be in the way of nobody.
+    wait_until_stepping(world);
     // One that is slow to leave, as on a busy machine.
     common::hold(world);
     supervisor.signal(Signal::KILL);

@@ -4,7 +4,9 @@
 
 mod common;
 
-use common::{ENDLESS, Process, TestRun, children, is_alive, send, ticks, wait_until, wait_within};
+use common::{
+    ENDLESS, Process, TestRun, children, is_alive, send, ticks, wait_until, wait_until_stepping, wait_within,
+};
 use rustix::process::Signal;
 use std::time::Duration;
 
@@ -12,11 +14,6 @@ use std::time::Duration;
 const SOON: Duration = Duration::from_secs(5);
 /// For what the processes do by themselves once a peer is gone; the machine may be busy with other tests.
 const BY_THEMSELVES: Duration = Duration::from_secs(10);
-
-/// A process that waits for others uses next to no processor time; one that steps uses all it gets.
-fn wait_until_stepping(world: u32) {
-    wait_until("the world to be stepping", || ticks(world) >= 10);
-}
 
 /// A `cz run` in the middle of things.
 struct Supervised {

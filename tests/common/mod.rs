@@ -378,6 +378,11 @@ pub fn begin(test_run: &TestRun, arguments: &[&str], processes: usize) -> (Proce
     (supervisor, parts)
 }
 
+/// A process that waits for others uses next to no processor time; one that steps uses all it gets.
+pub fn wait_until_stepping(world: u32) {
+    wait_until("the world to be stepping", || ticks(world) >= 10);
+}
+
 /// The process id of the first part of that name.
 pub fn part(parts: &[(String, u32)], name: &str) -> u32 {
     parts.iter().find(|(part, _)| part == name).unwrap_or_else(|| panic!("no {name} in {parts:?}")).1
