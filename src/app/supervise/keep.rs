@@ -18,6 +18,7 @@ use rustix::process::{
 use rustix::termios::tcsetpgrp;
 use signal_hook::consts::{SIGCHLD, SIGHUP, SIGINT, SIGKILL, SIGTERM};
 use signal_hook::iterator::Signals;
+use std::io::Write;
 use std::os::fd::AsFd;
 use std::os::unix::process::CommandExt;
 use std::process::{Command, Stdio};
@@ -29,6 +30,10 @@ const GRACE_AFTER_FAILURE: Duration = Duration::from_millis(300);
 /// Time between two rounds of killing: whose parent dies becomes our child.
 const ROUND: Duration = Duration::from_millis(10);
 
+/// What the shell does before the command: who keeps it says so in a line of stderr, which they share, and the command
+/// may say things without end of line.
+const WAITS_TO_BE_KNOWN: &str = r#"read -r _ || exit 1; exec sh -c "$0" </dev/null"#;
+
 /// Does not return once the command has been started.
 pub(in crate::app) fn keep(args: &KeepArgs) -> Result<(), AppError> {
     let failed = |what: &str, why: &dyn std::fmt::Display| AppError::Failed(format!("{what}: {why}"));
@@ -38,21 +43,24 @@ pub(in crate::app) fn keep(args: &KeepArgs) -> Result<(), AppError> {
     set_child_subreaper(Some(getpid())).map_err(|e| failed("cannot keep what the command starts", &e))?;
     follow_supervisor(Some(args.supervised))?;
     let mut command = Command::new("sh");
-    command.args(["-c", &args.command]).process_group(0);
+    command.process_group(0);
     if args.terminal {
+        command.args(["-c", &args.command]);
         // What it says does not go through the supervisor, which would keep a prompt until the line ends.
         let terminal = std::io::stdout().as_fd().try_clone_to_owned();
         command.stderr(terminal.map_err(|e| failed("cannot leave it the terminal", &e))?);
     } else {
-        command.stdin(Stdio::null());
+        command.args(["-c", WAITS_TO_BE_KNOWN, &args.command]).stdin(Stdio::piped());
     }
-    let child = command.spawn().map_err(|e| failed("cannot start sh", &e))?;
+    let mut child = command.spawn().map_err(|e| failed("cannot start sh", &e))?;
     let group = Pid::from_raw(child.id() as i32).expect("a process has an id");
     if args.terminal {
         // It may read there now, and is interrupted from there alone. Without a terminal there is nothing to be given.
         let _ = tcsetpgrp(std::io::stdin(), group);
     }
     say(PartLine::Keeps(child.id()).to_line());
+    // Who has died in the meantime is reaped below.
+    let _ = child.stdin.take().map(|mut go| go.write_all(b"\n"));
     let mut status = None;
     let mut is_ending = false;
     loop {
