@@ -4,7 +4,9 @@
 
 mod common;
 
-use common::{Ended, LONG_RUN, Process, TestRun, children, part, send, ticks, wait_until};
+use common::{
+    Ended, LONG_RUN, Process, TestRun, children, part, send, ticks, wait_until, wait_until_stepping,
+};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::process::Signal;
@@ -18,8 +20,7 @@ fn undisturbed() -> String {
 fn begin(test_run: &TestRun, arguments: &[&str], processes: usize) -> (Process, Vec<(String, u32)>) {
     let json = ["--json", "-"];
     let (supervisor, parts) = common::begin(test_run, &[&LONG_RUN[..], &json, arguments].concat(), processes);
-    let world = part(&parts, "world");
-    wait_until("the world to be stepping", || ticks(world) >= 5);
+    wait_until_stepping(part(&parts, "world"));
     (supervisor, parts)
 }
 
@@ -126,6 +127,45 @@ fn a_part_killed_again_and_again_is_replaced_each_time() {
     assert_eq!(common::hash(&summary), expected);
     assert_eq!(summary["replacements"].as_array().unwrap().len(), 5);
     test_run.assert_clean();
+}
+
+/// iceoryx2 waits without end for a file in shared memory that has no length, and whoever comes looks at all that the dead
+/// have left.
+#[test]
+fn who_was_killed_while_it_created_a_file_keeps_nobody_waiting() {
+    let test_run = TestRun::new("unfinished");
+    let (supervisor, parts) = begin(&test_run, &[], 3);
+    common::hold(supervisor.id());
+    let controller = part(&parts, "ctrl");
+    send(controller, Signal::KILL);
+    wait_until("the controller to be dead", || !common::is_alive(controller));
+    // One more of each connection there is: from a sender that is in it to nobody, and from nobody to a receiver.
+    let connections =
+        test_run.files().into_iter().filter(|file| file.extension() == Some("connection".as_ref()));
+    let mut unfinished = Vec::new();
+    for file in connections {
+        let (from, to) = file.file_stem().unwrap().to_str().unwrap().rsplit_once('_').unwrap();
+        let (rest, from) = from.rsplit_once('_').unwrap();
+        for name in [format!("{rest}_{from}_{}", other(to)), format!("{rest}_{}_{to}", other(from))] {
+            let path = file.with_file_name(name).with_extension("connection");
+            std::fs::File::create(&path).unwrap();
+            unfinished.push(path);
+        }
+    }
+    assert!(unfinished.len() >= 4, "{unfinished:?}");
+    supervisor.signal(Signal::CONT);
+    let ended = supervisor.ended();
+    assert!(!ended.err.contains("took longer than"), "{ended:?}");
+    let summary = ended.json();
+    assert_eq!(common::hash(&summary), undisturbed());
+    assert_eq!(summary["replacements"].as_array().unwrap().len(), 1);
+    test_run.assert_clean();
+}
+
+/// A number of as many digits.
+fn other(number: &str) -> String {
+    let (rest, last) = number.split_at(number.len() - 1);
+    format!("{rest}{}", (last.parse::<u32>().unwrap() + 1) % 10)
 }
 
 #[test]

@@ -75,6 +75,8 @@ const WAITING: usize = 1024;
 const LOOK: Duration = Duration::from_secs(1);
 /// Whoever has lost its supervisor leaves at once, but a busy machine may take its time over it.
 const LEAVING: Duration = Duration::from_secs(15);
+/// What a process has not finished creating that long after its end, nobody will finish.
+const SETTLED: Duration = Duration::from_millis(200);
 /// Of what a process has said last, this much is in a message, characters.
 const LAST_WORDS: usize = 500;
 
@@ -230,6 +232,9 @@ struct Children {
     refused: Vec<RefusedFrames>,
     /// When it was looked last whether programs have changed.
     looked_at_programs: Duration,
+    run: RunName,
+    /// When to look what who died last has not finished creating.
+    looks_for_unfinished: Option<Duration>,
     /// Processes that this one had started before, for something else.
     bystanders: Vec<u32>,
 }
@@ -265,6 +270,8 @@ impl Children {
             outcome: None,
             refused: Vec::new(),
             looked_at_programs: Duration::ZERO,
+            run: plan.run.clone(),
+            looks_for_unfinished: None,
             bystanders: children_of(std::process::id()),
         };
         children.cast(plan, observed);
@@ -403,6 +410,9 @@ impl Children {
         let now = self.time.look(2 * LOOK);
         let mut acts = Vec::new();
         self.look_at_programs(now, &mut acts);
+        if self.looks_for_unfinished.take_if(|due| *due <= now).is_some() {
+            RunSpace::remove_unfinished(&self.run);
+        }
         self.life.tick(now, &mut acts);
         self.act(acts);
         self.life.stage()
@@ -480,7 +490,8 @@ impl Children {
         let now = self.time.look(2 * LOOK);
         let is_watched = self.recipes.iter().any(|recipe| recipe.programs.is_some());
         let longest = if is_watched { programs::LOOK } else { LOOK };
-        let patience = self.life.next_due().map_or(longest, |due| due.saturating_sub(now).min(longest));
+        let due = self.life.next_due().into_iter().chain(self.looks_for_unfinished).min();
+        let patience = due.map_or(longest, |due| due.saturating_sub(now).min(longest));
         select! {
             recv(self.signals) -> signal => {
                 let name = signal.ok().and_then(signal_hook::low_level::signal_name).unwrap_or("a signal");
@@ -519,6 +530,7 @@ impl Children {
             Event::Ended { member, process } => {
                 let end = child::reap(process);
                 self.recipes[member].process = None;
+                self.looks_for_unfinished = Some(now + SETTLED);
                 self.life.ended(member, &end, now, is_stopped, &mut acts);
             }
         }

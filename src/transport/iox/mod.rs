@@ -8,6 +8,7 @@ mod name;
 mod place;
 mod ports;
 mod space;
+mod unfinished;
 mod watchdog;
 
 pub use bell::{Bell, BellRope, Bells, Ring, monotonic_ns};

@@ -30,7 +30,7 @@ const DAMAGED: &str = "damaged";
 /// A run's directory before its marker is in it; there is one at most, under the lock.
 const BEGINNING: &str = ".cz-begins";
 /// What the file in shared memory is called whose lock says that a run lives.
-const LOCK: &str = "lock";
+pub(super) const LOCK: &str = "lock";
 /// Names that are tried for the directory of all runs while somebody else has taken those before.
 const CANDIDATES: u32 = 10;
 /// Longest wait for others that come or go, which takes each of them milliseconds of processor time; where tens of

@@ -7,8 +7,9 @@ use super::bell::{BellRope, Bells};
 use super::error::{SHARED_MEMORY, SpaceError, failed};
 use super::leftovers::sweep_dead_runs;
 use super::name::RunName;
-use super::place::{Base, Found, Place, Presence, shared_memory};
+use super::place::{Base, Found, Place, Presence, prefixes_in_shared_memory, shared_memory};
 use super::ports::{Factory, IoxInbox, IoxOutbox};
+use super::unfinished::remove_unfinished;
 use super::watchdog::within_bounds;
 use crate::transport::{Backlog, TransportError};
 use iceoryx2::config::Config;
@@ -123,7 +124,7 @@ impl RunSpace {
         // Nobody takes away the directory of a run somebody is in; the next need not wait for what takes longer.
         drop(base);
         let config = config(&place)?;
-        let node = within_bounds(&format!("coming into run {run}"), || {
+        let node = within_bounds(&place.prefix, &format!("coming into run {run}"), || {
             let node = NodeBuilder::new()
                 .config(&config)
                 .signal_handling_mode(SignalHandlingMode::Disabled)
@@ -202,8 +203,8 @@ impl RunSpace {
     pub fn open<R: Record>(&self, name: &str) -> Result<Service<R>, SpaceError> {
         let builder = self.node().service_builder(&service_name(name)?);
         let builder = builder.publish_subscribe::<[R]>().user_header::<FrameHeader>();
-        let factory =
-            within_bounds(&format!("opening {name}"), || builder.open()).map_err(|e| open_error(name, e))?;
+        let factory = within_bounds(&self.prefix, &format!("opening {name}"), || builder.open())
+            .map_err(|e| open_error(name, e))?;
         Ok(Service { name: name.to_owned(), factory: Rc::new(factory) })
     }
 
@@ -253,7 +254,7 @@ impl RunSpace {
 
     /// Opens a participant's side of attaching.
     pub fn open_attach_line(&self) -> Result<AttachLine, SpaceError> {
-        within_bounds("asking the world for a place", || self.attach_line())
+        within_bounds(&self.prefix, "asking the world for a place", || self.attach_line())
     }
 
     fn attach_line(&self) -> Result<AttachLine, SpaceError> {
@@ -285,7 +286,15 @@ impl RunSpace {
 
     /// Removes what processes killed in this run have left, while others go on.
     pub fn sweep_dead(&self) {
-        within_bounds("removing what dead processes have left", || self.node().try_cleanup_dead_nodes());
+        within_bounds(&self.prefix, "removing what dead processes have left", || {
+            self.node().try_cleanup_dead_nodes()
+        });
+    }
+
+    /// Removes what a process of the run that was killed has not finished creating, for which others would wait.
+    pub fn remove_unfinished(run: &RunName) {
+        let prefixes = prefixes_in_shared_memory();
+        prefixes.iter().filter(|(name, _)| name == run).for_each(|(_, prefix)| remove_unfinished(prefix));
     }
 
     /// Says so when shared memory has no room for what the run's files may grow to: whoever writes where there
