@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{TestRun, files, unique_name, wait_until};
+use common::{TestRun, files, unique_name, wait_until, wait_until_stepping};
 use control_zones::record::Step;
 use control_zones::transport::iox::{BlockInbox, IoxOutbox, RunName, RunSpace};
 use control_zones::transport::{Loan, Outbox, Slots};
@@ -86,7 +86,7 @@ fn a_million_malformed_commands_change_nothing_and_are_all_counted() {
             service.is_some()
         });
         let mut outbox = service.unwrap().outbox(8).unwrap();
-        wait_until("the run to be under way", || common::ticks(world.id()) >= 5);
+        wait_until_stepping(world.id());
         // A world that waits sleeps, and nobody wakes it for frames that nobody announces.
         let rope = space.bells().unwrap().rope(Role::World, 0);
         let mut stopped = false;

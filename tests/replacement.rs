@@ -175,7 +175,7 @@ fn parts_started_by_hand_leave_and_rejoin() {
     let world = test_run.start("cz-world", &[&LONG_RUN[..], &["--json", "-"]].concat());
     let coordinator = test_run.start("cz-coord", &[]);
     let controller = test_run.start("cz-ctrl", &[]);
-    wait_until("the world to be stepping", || ticks(world.id()) >= 5);
+    wait_until_stepping(world.id());
     controller.signal(Signal::INT);
     controller.ended().expect(130, &["interrupted at step"]);
     coordinator.signal(Signal::KILL);
@@ -204,7 +204,7 @@ fn a_world_nobody_comes_back_to_gives_up_and_says_for_whom_it_waited() {
     let world = test_run.start("cz-world", &[&LONG_RUN[..], &["--peer-timeout", "1"]].concat());
     let coordinator = test_run.start("cz-coord", &[]);
     let controller = test_run.start("cz-ctrl", &[]);
-    wait_until("the world to be stepping", || ticks(world.id()) >= 5);
+    wait_until_stepping(world.id());
     let dead = format!("controller 0 (process {}) is gone", controller.id());
     controller.signal(Signal::KILL);
     world.ended().expect(1, &[&dead, "nobody took its place within 1 s", "commands of step"]);

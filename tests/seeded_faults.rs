@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{TestRun, children, hash, send, ticks, wait_until};
+use common::{TestRun, hash, part, send, wait_until_stepping};
 use control_zones::lockstep::in_process::InProcess;
 use control_zones::scenario::{Override, Scenario, load};
 use control_zones::world::{FaultCounts, World, WorldSummary};
@@ -164,15 +164,9 @@ fn a_killed_participant_is_replaced_without_a_trace() {
         TestRun::new("sf").start("cz", &[&arguments[..], &["--in-process"]].concat()).ended().json();
     for victim in ["ctrl", "coord"] {
         let test_run = TestRun::new("sf");
-        let supervisor = test_run.start("cz", &arguments);
-        let mut target = None;
-        wait_until("the run to be in the middle of things", || {
-            let parts = children(supervisor.id());
-            let part = |name| parts.iter().find(|(_, line)| line.get(1).is_some_and(|part| part == name));
-            target = part(victim).map(|(id, _)| *id);
-            target.is_some() && part("world").is_some_and(|(id, _)| ticks(*id) >= 5)
-        });
-        send(target.expect("the wait ended with one"), Signal::KILL);
+        let (supervisor, parts) = common::begin(&test_run, &arguments, 3);
+        wait_until_stepping(part(&parts, "world"));
+        send(part(&parts, victim), Signal::KILL);
         let summary = supervisor.ended().json();
         assert_eq!(summary["replacements"].as_array().unwrap().len(), 1, "{summary}");
         assert_eq!(hash(&summary), hash(&expected), "{victim}");

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{LONG_RUN, TestRun, part, send, ticks, wait_until};
+use common::{LONG_RUN, TestRun, part, send, wait_until_stepping};
 use rustix::process::Signal;
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -82,7 +82,7 @@ fn who_is_replaced_is_in_the_trace_of_the_world() {
     let arguments = [&LONG_RUN[..], &["--json", "-", "--trace", path.to_str().unwrap()]].concat();
     let (supervisor, parts) = common::begin(&test_run, &arguments, 3);
     let world = part(&parts, "world");
-    wait_until("the world to be stepping", || ticks(world) >= 5);
+    wait_until_stepping(world);
     send(part(&parts, "ctrl"), Signal::KILL);
     let replacements = supervisor.ended().json()["replacements"].as_array().unwrap().len();
     assert_eq!(replacements, 1);

@@ -378,9 +378,19 @@ pub fn begin(test_run: &TestRun, arguments: &[&str], processes: usize) -> (Proce
     (supervisor, parts)
 }
 
-/// A process that waits for others uses next to no processor time; one that steps uses all it gets.
+/// Waits until a run is under way: its world has opened it and uses processor time since, of which it takes next to none
+/// while it waits for others.
 pub fn wait_until_stepping(world: u32) {
-    wait_until("the world to be stepping", || ticks(world) >= 10);
+    let id = world.to_string();
+    let is_own = |path: &PathBuf| {
+        path.to_string_lossy().ends_with("_world")
+            && std::fs::read_to_string(path).is_ok_and(|text| text == id)
+    };
+    wait_until("the world to have opened its run", || {
+        std::fs::read_dir("/dev/shm").unwrap().flatten().any(|file| is_own(&file.path()))
+    });
+    let before = ticks(world);
+    wait_until("the world to be stepping", || ticks(world) >= before + 5);
 }
 
 /// The process id of the first part of that name.
