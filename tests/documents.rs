@@ -512,8 +512,8 @@ fn tests_that_are_run_by_hand_are_named() {
             files(&root().join(folder)).iter().filter(|file| file.extension().is_some_and(|e| e == "rs"))
         {
             let left_out = std::fs::read_to_string(file).unwrap().matches("\n#[ignore").count();
-            // Of a folder of files one is the test's.
-            let own = file.parent().filter(|parent| parent.join("main.rs").exists()).unwrap_or(file);
+            // Several files may be one module.
+            let own = file.parent().filter(|parent| parent.join("mod.rs").exists()).unwrap_or(file);
             let name = own.file_stem().unwrap().to_str().unwrap();
             let named = contributing.matches(&format!("`{name}`")).count();
             assert!(left_out == 0 || named > 0, "{}: CONTRIBUTING.md names no `{name}`", file.display());

@@ -43,7 +43,7 @@ pub const ENDLESS: [&str; 13] = [
     "roads.merge2.demand.rates=[{until_s=3600000.0,vehicles_per_hour=300.0}]",
     "--peer-timeout",
     "60",
-    // Whom others replace: tests/replacement.rs.
+    // Whom others replace: tests/runs/replacement.rs.
     "--restart",
     "never",
 ];
