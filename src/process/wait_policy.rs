@@ -16,7 +16,8 @@
 //! next step. At first it is crowded when more want to run than there is room for: that may be a program that is just
 //! ending, so it is asked again soon, and after ever longer. Once that has gone on for long the cores must have
 //! had idle time, which they have among waiters that sleep, and have not beside work that never ends. Where this run
-//! alone has more processes that wait busily than there are cores, their number says nothing, and turns and idle time do.
+//! alone has more processes that wait busily than there are cores, their number only says that there is no crowd, when no
+//! others are among them; turns and idle time say that there is.
 //!
 //! Times are nanoseconds on one clock, and are given; so the policy can be tested without waiting.
 
@@ -89,7 +90,7 @@ struct Crowd {
     /// When the idle time of the cores was asked for last, and what it was.
     asked: Option<u64>,
     idle_ns: u64,
-    /// How many processes want to run says whether others do.
+    /// How many processes want to run says whether others do; otherwise only that they do not.
     numbers_tell: bool,
 }
 
@@ -276,11 +277,10 @@ impl Crowd {
     fn is_seen(&mut self, now: u64, cores: impl Fn() -> Cores) -> bool {
         if !self.is_there {
             let cores = cores();
-            let are_full = cores.are_full.filter(|_| self.numbers_tell);
-            if are_full == Some(false) {
+            if cores.are_full == Some(false) {
                 return false;
             }
-            let least = if are_full.is_some() { LEAST_HOLD } else { IDLE_HOLD };
+            let least = if self.are_known_to_be_full(&cores) { LEAST_HOLD } else { IDLE_HOLD };
             let is_back = self.until > 0 && now < self.until + 4 * self.hold_ns + BACK;
             self.hold_ns = if is_back { (2 * self.hold_ns).min(GREATEST_HOLD) } else { least };
             self.is_there_since(now, &cores);
@@ -307,8 +307,10 @@ impl Crowd {
         if self.is_there && now >= self.until {
             let cores = cores();
             self.is_there = match cores.are_full {
-                Some(are_full) if self.numbers_tell && self.hold_ns < IDLE_HOLD => are_full,
-                _ => cores.idle_ns.saturating_sub(self.idle_ns) < (now - asked) / IDLE_SHARE,
+                _ if self.hold_ns >= IDLE_HOLD => self.lacks_idle_time(now, asked, &cores),
+                Some(false) => false,
+                _ if self.are_known_to_be_full(&cores) => true,
+                _ => self.lacks_idle_time(now, asked, &cores),
             };
             if self.is_there {
                 self.hold_ns = self.hold_ns.max((2 * self.hold_ns).min(IDLE_HOLD));
@@ -316,6 +318,16 @@ impl Crowd {
             }
         }
         self.is_there
+    }
+
+    /// Whether the number of processes that want to run says that there are too few cores.
+    fn are_known_to_be_full(&self, cores: &Cores) -> bool {
+        self.numbers_tell && cores.are_full == Some(true)
+    }
+
+    /// Whether the cores have been next to never idle since.
+    fn lacks_idle_time(&self, now: u64, since: u64, cores: &Cores) -> bool {
+        cores.idle_ns.saturating_sub(self.idle_ns) < (now - since) / IDLE_SHARE
     }
 }
 
@@ -555,9 +567,27 @@ mod tests {
         let mut scene = Scene::new(shared, false);
         assert!(!scene.policy.begins_spinning(false));
         assert_eq!(scene.wait(50 * US, false, 10 * US), Cost { polled_ns: 50 * US, yields: 5, sleeps: 0 });
-        // Somebody else's turn.
+        // A peer's turn, which nobody else wanted.
+        scene.wait(4 * MS, false, 3 * MS);
+        assert_eq!(scene.wait(50 * US, false, 10 * US).sleeps, 0);
+        // Somebody else's.
+        scene.is_busy = true;
         scene.wait(4 * MS, false, 3 * MS);
         assert_eq!(scene.wait(50 * US, false, 10 * US), Cost { sleeps: 1, ..Cost::default() });
+    }
+
+    #[test]
+    fn with_fewer_cores_than_pollers_no_crowd_lasts_once_nobody_else_wants_to_run() {
+        let mut policy = WaitPolicy::new(Situation { shares_cores: true, ..ALONE });
+        // Its peers keep all cores from being idle.
+        let cores = |are_full| move || Cores { idle_ns: 0, are_full: Some(are_full) };
+        // When it begins, others of its run are not counted for such yet.
+        let begun = 3_600_000 * MS;
+        assert_eq!(policy.look(begun, false, cores(true)), Advice::Sleep);
+        policy.came(|| begun + 2 * MS);
+        assert_eq!(policy.look(begun + 2 * MS, false, cores(true)), Advice::Sleep, "they want to run still");
+        policy.came(|| begun + 6 * MS);
+        assert_eq!(policy.look(begun + 6 * MS, false, cores(false)), Advice::Yield);
     }
 
     #[test]
