@@ -275,17 +275,19 @@ impl WaitPolicy {
 impl Crowd {
     /// Somebody had the core for as long as others' turns take: whether it is one who will want it again.
     fn is_seen(&mut self, now: u64, cores: impl Fn() -> Cores) -> bool {
-        if !self.is_there {
-            let cores = cores();
-            if cores.are_full == Some(false) {
-                return false;
-            }
-            let least = if self.are_known_to_be_full(&cores) { LEAST_HOLD } else { IDLE_HOLD };
-            let is_back = self.until > 0 && now < self.until + 4 * self.hold_ns + BACK;
-            self.hold_ns = if is_back { (2 * self.hold_ns).min(GREATEST_HOLD) } else { least };
-            self.is_there_since(now, &cores);
+        if self.is_there {
+            self.until = now + self.hold_ns;
+            return true;
         }
-        self.until = now + self.hold_ns;
+        let cores = cores();
+        if cores.are_full == Some(false) {
+            return false;
+        }
+        let is_known = self.numbers_tell && cores.are_full.is_some();
+        let least = if is_known { LEAST_HOLD } else { IDLE_HOLD };
+        let is_back = self.until > 0 && now < self.until + 4 * self.hold_ns + BACK;
+        self.hold_ns = if is_back { (2 * self.hold_ns).min(GREATEST_HOLD) } else { least };
+        self.is_there_since(now, &cores);
         true
     }
 
@@ -307,10 +309,9 @@ impl Crowd {
         if self.is_there && now >= self.until {
             let cores = cores();
             self.is_there = match cores.are_full {
-                _ if self.hold_ns >= IDLE_HOLD => self.lacks_idle_time(now, asked, &cores),
-                Some(false) => false,
-                _ if self.are_known_to_be_full(&cores) => true,
-                _ => self.lacks_idle_time(now, asked, &cores),
+                // That nobody else wants to run is believed in any case.
+                Some(are_full) if self.hold_ns < IDLE_HOLD && (self.numbers_tell || !are_full) => are_full,
+                _ => cores.idle_ns.saturating_sub(self.idle_ns) < (now - asked) / IDLE_SHARE,
             };
             if self.is_there {
                 self.hold_ns = self.hold_ns.max((2 * self.hold_ns).min(IDLE_HOLD));
@@ -318,16 +319,6 @@ impl Crowd {
             }
         }
         self.is_there
-    }
-
-    /// Whether the number of processes that want to run says that there are too few cores.
-    fn are_known_to_be_full(&self, cores: &Cores) -> bool {
-        self.numbers_tell && cores.are_full == Some(true)
-    }
-
-    /// Whether the cores have been next to never idle since.
-    fn lacks_idle_time(&self, now: u64, since: u64, cores: &Cores) -> bool {
-        cores.idle_ns.saturating_sub(self.idle_ns) < (now - since) / IDLE_SHARE
     }
 }
 
