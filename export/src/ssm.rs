@@ -151,8 +151,8 @@ impl<'a> Ssm<'a> {
         if owed.kind == DutyKind::RearEnd {
             return;
         }
-        let area_m =
-            self.conflicts[owed.zone as usize].points().get(owed.point as usize).map_or(0.0, |p| p.area_m);
+        let mut uses = self.conflicts[owed.zone as usize].uses(foe.path).iter();
+        let area_m = uses.find(|u| u.point == owed.point).map_or(0.0, |u| u.area_m);
         let partner_m = foe.x_m - (owed.pair.partner_x_m - owed.own_m);
         let key = (owed.zone, owed.vehicle, owed.partner, owed.point);
         self.passings.entry(key).or_insert(Passing {

@@ -82,8 +82,8 @@ impl Picture {
     fn add_points(&mut self, network: &Network, zone: ZoneId, shapes: &Shapes) {
         let conflicts = Conflicts::of(network, zone);
         for (at, point) in (0..).zip(conflicts.points()) {
-            let Some((path, at_m)) = conflicts.first_use(at) else { continue };
-            let place = shapes.on_path(network, zone, path, at_m);
+            let Some((path, passes)) = conflicts.first_use(at) else { continue };
+            let place = shapes.on_path(network, zone, path, passes.at_m);
             self.points.push((place, point.kind, point.name.clone()));
         }
     }

@@ -1,7 +1,7 @@
 //! Surrogate safety measures over a run: how many pairs came close, by time to collision, deceleration to avoid one, and
 //! post-encroachment time, whoever owes whom what.
 
-use crate::conflict::{Conflicts, PointKind};
+use crate::conflict::Conflicts;
 use crate::world::World;
 use ipc_schemas::{NO_ZONE, VehicleState};
 use serde::{Deserialize, Serialize};
@@ -120,7 +120,6 @@ impl Encounters {
         let conflicts = &self.conflicts[state.zone as usize];
         for own in conflicts.uses(state.path) {
             let passes = |at_m: f64| before_m < at_m && at_m <= state.x_m;
-            let point = &conflicts.points()[own.point as usize];
             let cleared = self.cleared.entry((state.zone, own.point)).or_default();
             if passes(own.at_m) {
                 let on_another_lane = |&&(path, _): &&(u32, f64)| {
@@ -130,8 +129,7 @@ impl Encounters {
                 let last_s = cleared.iter().filter(on_another_lane).map(|(_, s)| *s).fold(-1e9, f64::max);
                 self.counts.pet += u32::from(time_s - last_s < PET_S);
             }
-            let area_m = if point.kind == PointKind::Crossing { point.area_m } else { 0.0 };
-            if passes(own.at_m + area_m + state.length_m) {
+            if passes(own.at_m + own.area_m + state.length_m) {
                 cleared.retain(|(path, _)| *path != state.path);
                 cleared.push((state.path, time_s));
             }

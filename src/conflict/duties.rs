@@ -261,7 +261,7 @@ impl Duties {
                 if !is_crossing && !other.is_free {
                     continue;
                 }
-                let gap_m = point.area_m + other.length_m;
+                let gap_m = theirs.area_m + other.length_m;
                 let hides = |&(lane, nearer): &(u32, usize)| {
                     let nearer = &rows[nearer];
                     lane == theirs.lane()

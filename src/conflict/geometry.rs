@@ -1,6 +1,6 @@
 //! Where the paths of a zone conflict.
 
-use crate::scenario::{Network, Zone, ZoneId};
+use crate::scenario::{ConflictArea, Crossing, Network, Path, Zone, ZoneId};
 
 /// Conflict points on a path nearer to each other than this are in one box, m: between two that are further apart
 /// there is room for the longest vehicles.
@@ -22,8 +22,6 @@ pub struct Point {
     pub kind: PointKind,
     /// Name of the crossing, or of the segment or exit that paths merge into.
     pub name: String,
-    /// Extent of the conflict area along a path, m; 0 at a merge.
-    pub area_m: f64,
 }
 
 /// A path's passage of a conflict point.
@@ -33,6 +31,8 @@ pub struct Use {
     pub point: u32,
     /// Distance from the zone's origin on this path, m (the literature's L_k).
     pub at_m: f64,
+    /// Extent of the conflict area along the path, m; 0 at a merge.
+    pub area_m: f64,
     /// Where the box begins that the point is in: the points that follow one another so closely that who stands between
     /// two of them may stand in others' way, m.
     pub box_m: f64,
@@ -75,6 +75,33 @@ struct PathConflicts {
     shared: Vec<(u32, Run)>,
 }
 
+/// Where what is to be kept clear begins that a place on a path is in, or at the end of, m; the place itself where it is in
+/// nothing of the kind.
+fn kept_clear_from_m(zone: &Zone, path: &Path, at_m: f64) -> f64 {
+    let (mut from_m, mut kept_m) = (0.0, None);
+    for segment in path.segments.iter().map(|&s| &zone.segments[s as usize]) {
+        if from_m >= at_m {
+            break;
+        }
+        kept_m = kept_m.filter(|_| segment.keep_clear).or(segment.keep_clear.then_some(from_m));
+        from_m += segment.length_m;
+    }
+    kept_m.unwrap_or(at_m)
+}
+
+/// Whether a crossing is where ways part: it begins where its segments do, behind one and the same. Who has passed that is
+/// near the other way still, and counts as ahead of those on it for so long.
+fn is_divergence(zone: &Zone, crossing: &Crossing) -> bool {
+    let mut before = crossing.places.iter().flat_map(|&ConflictArea { segment, from_m, .. }| {
+        zone.paths.iter().filter_map(move |path| {
+            let at = path.segments.iter().position(|&s| s == segment)?;
+            Some(at.checked_sub(1).filter(|_| from_m == 0.0).map(|at| path.segments[at]))
+        })
+    });
+    let first = before.next().flatten();
+    first.is_some() && before.all(|segment| segment == first)
+}
+
 /// What is behind an exit.
 #[derive(Clone, Debug, Default)]
 struct Onward {
@@ -113,7 +140,7 @@ impl Conflicts {
             .map(|exit| {
                 exit.to.map_or_else(Onward::default, |to| {
                     let there = &network.zones[to.zone as usize];
-                    let segments = |path: &crate::scenario::Path| {
+                    let segments = |path: &Path| {
                         let own = path.segments.iter().map(|&s| (s, there.segments[s as usize].length_m));
                         if path.segments[0] == to.segment { own.collect() } else { Vec::new() }
                     };
@@ -136,13 +163,14 @@ impl Conflicts {
         conflicts.goes_on_together = conflicts.exits.len() == 1
             && conflicts.exits.iter().all(is_one_way)
             && shared.all(|(_, run)| run.to_m == f64::INFINITY);
-        for path in &mut conflicts.paths {
+        for (path, shape) in conflicts.paths.iter_mut().zip(&zone.paths) {
             path.uses.sort_by(|a, b| a.at_m.total_cmp(&b.at_m));
             path.meets_from_m = path.uses.first().map_or(f64::INFINITY, |first| first.at_m);
+            path.uses.iter_mut().for_each(|u| u.box_m = kept_clear_from_m(zone, shape, u.at_m));
             for at in 1..path.uses.len() {
                 let before = path.uses[at - 1];
                 if path.uses[at].at_m - before.at_m < BOX_M {
-                    path.uses[at].box_m = before.box_m;
+                    path.uses[at].box_m = path.uses[at].box_m.min(before.box_m);
                 }
             }
         }
@@ -159,11 +187,11 @@ impl Conflicts {
         &self.paths[path as usize].uses
     }
 
-    /// The first path that passes a conflict point, and where on it, m.
-    pub fn first_use(&self, point: u32) -> Option<(u32, f64)> {
+    /// The first path that passes a conflict point, and its passage.
+    pub fn first_use(&self, point: u32) -> Option<(u32, &Use)> {
         (0..)
             .zip(&self.paths)
-            .find_map(|(path, own)| own.uses.iter().find(|u| u.point == point).map(|u| (path, u.at_m)))
+            .find_map(|(path, own)| own.uses.iter().find(|u| u.point == point).map(|u| (path, u)))
     }
 
     /// Length of a path, m.
@@ -193,7 +221,7 @@ impl Conflicts {
         let path = &self.paths[path as usize];
         let crossings =
             path.uses.iter().filter(|u| self.points[u.point as usize].kind == PointKind::Crossing);
-        let clears = crossings.map(|u| u.at_m + self.points[u.point as usize].area_m + length_m + reach_m);
+        let clears = crossings.map(|u| u.at_m + u.area_m + length_m + reach_m);
         let behind_m = clears.fold(f64::NEG_INFINITY, f64::max) - path.length_m;
         if path.ends_among_others { behind_m.max(length_m) } else { behind_m }
     }
@@ -201,7 +229,7 @@ impl Conflicts {
     fn find_merges(&mut self, zone: &Zone) {
         // Where a segment begins to which paths come over different ones.
         for (segment, shape) in (0..).zip(&zone.segments) {
-            let before = |path: &crate::scenario::Path| {
+            let before = |path: &Path| {
                 let at = path.segments.iter().position(|&s| s == segment)?;
                 Some(path.segments[at.checked_sub(1)?])
             };
@@ -209,11 +237,11 @@ impl Conflicts {
             if zone.paths.iter().filter_map(before).all(|s| Some(s) == first) {
                 continue;
             }
-            let point = self.point(PointKind::Merge, &shape.name, 0.0);
+            let point = self.point(PointKind::Merge, &shape.name);
             for (path, own) in zone.paths.iter().zip(&mut self.paths) {
                 let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
                 let at_m = path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
-                own.uses.push(Use { point, at_m, box_m: at_m, lane: path.segments[at - 1] });
+                own.uses.push(Use { point, at_m, area_m: 0.0, box_m: at_m, lane: path.segments[at - 1] });
             }
         }
         // Where paths end that leave by one exit and have not come together before.
@@ -223,27 +251,24 @@ impl Conflicts {
             if leaving.all(|path| Some(path.last_segment) == first) {
                 continue;
             }
-            let point = self.point(PointKind::Merge, &shape.name, 0.0);
+            let point = self.point(PointKind::Merge, &shape.name);
             for own in self.paths.iter_mut().filter(|path| path.exit == exit) {
-                own.uses.push(Use { point, at_m: own.length_m, box_m: own.length_m, lane: own.last_segment });
+                let at_m = own.length_m;
+                own.uses.push(Use { point, at_m, area_m: 0.0, box_m: at_m, lane: own.last_segment });
             }
         }
     }
 
     fn find_crossings(&mut self, zone: &Zone) {
-        for crossing in &zone.crossings {
-            let point = self.point(PointKind::Crossing, &crossing.name, crossing.length_m);
-            for &(segment, at_m) in &crossing.places {
+        for crossing in zone.crossings.iter().filter(|crossing| !is_divergence(zone, crossing)) {
+            let point = self.point(PointKind::Crossing, &crossing.name);
+            for &ConflictArea { segment, from_m, length_m } in &crossing.places {
                 for (path, own) in zone.paths.iter().zip(&mut self.paths) {
                     let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
                     let before_m: f64 =
                         path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
-                    own.uses.push(Use {
-                        point,
-                        at_m: before_m + at_m,
-                        box_m: before_m + at_m,
-                        lane: segment,
-                    });
+                    let at_m = before_m + from_m;
+                    own.uses.push(Use { point, at_m, area_m: length_m, box_m: at_m, lane: segment });
                 }
             }
         }
@@ -254,7 +279,7 @@ impl Conflicts {
         for (index, path) in (0..).zip(&zone.paths) {
             path.segments.iter().for_each(|&s| by_segment[s as usize].push(index));
         }
-        let starts = |path: &crate::scenario::Path| {
+        let starts = |path: &Path| {
             path.segments
                 .iter()
                 .scan(0.0, |at, &s| {
@@ -265,6 +290,15 @@ impl Conflicts {
                 .collect::<Vec<f64>>()
         };
         let all_starts: Vec<Vec<f64>> = zone.paths.iter().map(starts).collect();
+        let divergences: Vec<&Crossing> =
+            zone.crossings.iter().filter(|crossing| is_divergence(zone, crossing)).collect();
+        let near_m = |own: u32, theirs: Option<&u32>| {
+            let mut both = divergences.iter().filter_map(|d| {
+                let (own, _) = d.area_on(own).zip(d.area_on(*theirs?))?;
+                Some(own.length_m)
+            });
+            both.next().unwrap_or(0.0)
+        };
         for (index, path) in zone.paths.iter().enumerate() {
             let mut others: Vec<u32> =
                 path.segments.iter().flat_map(|&s| by_segment[s as usize].iter().copied()).collect();
@@ -286,7 +320,7 @@ impl Conflicts {
                         && their_end == theirs.segments.len()
                         && path.exit == theirs.exit;
                     let to_m = match all_starts[index].get(end) {
-                        Some(&start) => start,
+                        Some(&start) => start + near_m(path.segments[end], theirs.segments.get(their_end)),
                         None if goes_on => f64::INFINITY,
                         None => path.length_m,
                     };
@@ -298,8 +332,8 @@ impl Conflicts {
         }
     }
 
-    fn point(&mut self, kind: PointKind, name: &str, area_m: f64) -> u32 {
-        self.points.push(Point { kind, name: name.to_owned(), area_m });
+    fn point(&mut self, kind: PointKind, name: &str) -> u32 {
+        self.points.push(Point { kind, name: name.to_owned() });
         self.points.len() as u32 - 1
     }
 
@@ -354,5 +388,72 @@ impl Use {
     /// Whether two paths pass the point on one lane, so that their vehicles follow each other there.
     pub fn on_lane_of(&self, other: &Use) -> bool {
         self.lane == other.lane
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+    use crate::scenario::load_given;
+
+    /// A lane from which ways part, and one that meets both.
+    fn conflicts(segments: &str, crossings: &str) -> Conflicts {
+        let text = format!(
+            "name = \"parting\"\nseed = 1\ndt_s = 0.1\nobjective = {{ beta = 1 }}\n[end]\ntime_s = 9\n[vehicle]\nu_min_mps2 = -4\n\
+             u_max_mps2 = 4\nv_max_mps = 20\nlength_m = 4.5\nreaction_time_s = 1\nstandstill_gap_m = 0\n\
+             [[zones]]\nname = \"zone\"\nsegments = [\n{{ name = \"in\", length_m = 100, road = \"road\" }},\n\
+             {{ name = \"other\", length_m = 50, road = \"side\" }},\n{{ name = \"on\", length_m = 20 }},\n{segments}\n]\npaths = [\n\
+             {{ name = \"l\", segments = [\"in\", \"left\"], exit = \"l\" }},\n\
+             {{ name = \"r\", segments = [\"in\", \"right\"], exit = \"r\" }},\n\
+             {{ name = \"o\", segments = [\"other\", \"on\"], exit = \"o\" }},\n]\ncrossings = [{crossings}]\n{}",
+            ["road", "side"].map(road).concat()
+        );
+        let scenario = load_given(&text, Vec::new(), &[], None).unwrap();
+        Conflicts::of(&scenario.network, 0)
+    }
+
+    fn road(name: &str) -> String {
+        format!(
+            "[[roads]]\nname = \"{name}\"\ndemand = {{ rates = [{{ until_s = 1, vehicles_per_hour = 1 }}], min_headway_s = 1, \
+             speed_mean_mps = 9, speed_sd_mps = 0, speed_min_mps = 9, speed_max_mps = 9 }}\n"
+        )
+    }
+
+    #[test]
+    fn ways_that_part_are_one_for_as_long_as_they_are_near_each_other() {
+        let segments = "{ name = \"left\", length_m = 20 },\n{ name = \"right\", length_m = 20 }";
+        let parts = "{ name = \"d\", at = { left = [0, 6], right = [0, 4] } }";
+        let meets = "{ name = \"c\", length_m = 3, at = { left = 8, on = 5 } }";
+        let parted = conflicts(segments, &format!("{parts}, {meets}"));
+        let names: Vec<&str> = parted.points().iter().map(|point| point.name.as_str()).collect();
+        assert_eq!(names, ["c"], "where they part nobody crosses");
+        for (own, other, to_m) in [(0, 1, 106.0), (1, 0, 104.0)] {
+            let mut runs = Vec::new();
+            parted.runs((own, u32::MAX), (other, u32::MAX), |run| runs.push(run));
+            assert_eq!(runs, [Run { from_m: 0.0, to_m, other_from_m: 0.0 }]);
+        }
+        // Areas that begin later, or of segments behind different ones, are crossings.
+        for at in ["left = [1, 6], right = [0, 4]", "left = [0, 6], on = [0, 4]"] {
+            let crossing = format!("{{ name = \"d\", at = {{ {at} }} }}");
+            assert_eq!(conflicts(segments, &crossing).points().len(), 1, "{at}");
+        }
+    }
+
+    #[test]
+    fn a_box_begins_where_what_is_kept_clear_does() {
+        let meets = "{ name = \"c\", at = { left = [8, 11], on = [5, 9] } }";
+        for (keep_clear, box_m) in [(false, 108.0), (true, 100.0)] {
+            let segments = format!(
+                "{{ name = \"left\", length_m = 20, keep_clear = {keep_clear} }},\n{{ name = \"right\", length_m = 20 }}"
+            );
+            let conflicts = conflicts(&segments, meets);
+            let found: Vec<(f64, f64, f64)> =
+                conflicts.uses(0).iter().map(|u| (u.at_m, u.area_m, u.box_m)).collect();
+            assert_eq!(found, [(108.0, 3.0, box_m)]);
+            let other: Vec<(f64, f64, f64)> =
+                conflicts.uses(2).iter().map(|u| (u.at_m, u.area_m, u.box_m)).collect();
+            assert_eq!(other, [(55.0, 4.0, 55.0)]);
+        }
     }
 }

@@ -1,7 +1,7 @@
 //! Where a human stops for others, and whether it can be told to.
 
 use super::duties::Row;
-use super::geometry::{Conflicts, Point, PointKind};
+use super::geometry::{Conflicts, Point, PointKind, Use};
 use crate::scenario::{HumanParams, VehicleParams};
 use crate::vehicle::driver::can_be_told;
 
@@ -38,11 +38,11 @@ pub fn can_yield(
     })
 }
 
-/// How far beyond a point a vehicle is clear of it, m.
-pub fn clear_m(point: &Point, length_m: f64) -> f64 {
+/// How far beyond a point on its path a vehicle is clear of it, m.
+pub fn clear_m(point: &Point, passes: &Use, length_m: f64) -> f64 {
     match point.kind {
         PointKind::Merge => 0.0,
-        PointKind::Crossing => point.area_m + length_m,
+        PointKind::Crossing => passes.area_m + length_m,
     }
 }
 
@@ -50,7 +50,7 @@ pub fn clear_m(point: &Point, length_m: f64) -> f64 {
 pub fn stands_on(conflicts: &Conflicts, inside: &Row, other: &Row) -> bool {
     conflicts.uses(inside.path).iter().any(|own| {
         let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
-        let to_m = own.at_m + clear_m(&conflicts.points()[own.point as usize], inside.length_m);
+        let to_m = own.at_m + clear_m(&conflicts.points()[own.point as usize], own, inside.length_m);
         (own.at_m..to_m).contains(&inside.x_m)
             && theirs.is_some_and(|theirs| !theirs.on_lane_of(own) && other.x_m < theirs.at_m)
     })
@@ -61,7 +61,7 @@ pub fn is_in_the_way(conflicts: &Conflicts, inside: &Row, other: &Row) -> bool {
     conflicts.uses(inside.path).iter().filter(|own| own.box_m <= inside.x_m).any(|own| {
         let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
         let point = &conflicts.points()[own.point as usize];
-        inside.x_m < own.at_m + clear_m(point, inside.length_m)
+        inside.x_m < own.at_m + clear_m(point, own, inside.length_m)
             && theirs.is_some_and(|theirs| !theirs.on_lane_of(own) && other.x_m < theirs.at_m)
     })
 }

@@ -257,13 +257,14 @@ fn lanes(zone: &Zone, step_m: f64) -> Check {
     }
     require(is_used.iter().chain(&is_left_by).all(|used| *used), bad)?;
     for crossing in &zone.crossings {
-        inside("length_m", crossing.length_m, &ranges::CROSSING_LENGTH)?;
         require(crossing.places.len() >= 2, bad)?;
-        for &(segment, at_m) in &crossing.places {
-            let segment = zone.segments.get(segment as usize);
-            require(segment.is_some_and(|s| (0.0..=s.length_m).contains(&at_m)), bad)?;
+        for area in &crossing.places {
+            inside("length_m", area.length_m, &ranges::CROSSING_LENGTH)?;
+            let segment = zone.segments.get(area.segment as usize);
+            require(segment.is_some_and(|s| (0.0..=s.length_m).contains(&area.from_m)), bad)?;
         }
-        let passed = |path: &Path| crossing.places.iter().filter(|(s, _)| path.segments.contains(s)).count();
+        let passed =
+            |path: &Path| crossing.places.iter().filter(|area| path.segments.contains(&area.segment)).count();
         require(zone.paths.iter().all(|path| passed(path) <= 1), bad)?;
     }
     Ok(())

@@ -461,10 +461,16 @@ pub(in crate::scenario) static APPROACHES: Keys = &[
         "driven on that road where nobody is in the way",
     ),
 ];
+pub(in crate::scenario) static KEEP_CLEAR: Flag = Flag {
+    name: "keep_clear",
+    default: false,
+    meaning: "of no entrance: whoever is to let a human pass who does not follow the order waits before it, not on it",
+};
 pub(in crate::scenario) static SEGMENTS: Keys = &[
     &other("name", "text", "required", "unique in the zone"),
     &other("length_m", "a length from 0.01 to 1e6 m", "that of `shape`", ""),
     &other("shape", "list of points `[x, y]` in m", "not drawn to scale", "how it lies"),
+    &KEEP_CLEAR,
     &other("road", "text", "no entrance", "of an entrance: as in `zones.approaches`"),
     &other("zone", "text", "no entrance", "of an entrance: as in `zones.approaches`"),
     &other("exit", "text", "its only exit", "as in `zones.approaches`"),
@@ -488,12 +494,17 @@ pub(in crate::scenario) static EXITS: Keys = &[
 ];
 pub(in crate::scenario) static CROSSINGS: Keys = &[
     &other("name", "text", "required", "unique in the zone"),
-    &other("length_m", "a length from 0.1 to 1000 m", "required", "extent of the conflict area along a path"),
+    &other(
+        "length_m",
+        "a length from 0.1 to 1000 m",
+        "required where `at` does not say it",
+        "extent of the conflict area along a path",
+    ),
     &other(
         "at",
         "table",
         "required",
-        "segments, and where the area begins on each, m: `{ a = 12.5, b = 8 }`",
+        "segments, and where the area begins on each, or begins and ends, m: `{ a = 12.5, b = [8, 12] }`",
     ),
 ];
 

@@ -39,8 +39,8 @@ pub use load::{
     load_recorded, text_of,
 };
 pub use network::{
-    Crossing, Downstream, EntryRule, Exit, LawKind, Network, PassingOrder, Path, Road, Route, Segment,
-    Source, Zone, ZoneId,
+    ConflictArea, Crossing, Downstream, EntryRule, Exit, LawKind, Network, PassingOrder, Path, Road, Route,
+    Segment, Source, Zone, ZoneId,
 };
 pub use params::{
     ControlParams, CoordinationParams, FeConditions, PositionFeedback, ReferenceLaw, Replan, SafetyRows,

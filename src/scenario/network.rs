@@ -48,6 +48,8 @@ pub struct Segment {
     pub source: Option<Source>,
     /// Polyline it is drawn as, m; empty when nobody said.
     pub shape: Vec<[f64; 2]>,
+    /// Whether one that is to let a human pass who does not follow the order waits before it, not on it.
+    pub keep_clear: bool,
 }
 
 /// One way through a zone.
@@ -108,10 +110,26 @@ pub struct Downstream {
 pub struct Crossing {
     /// Name, unique within the zone.
     pub name: String,
-    /// Extent of the conflict area along a path, m.
+    /// Where it is on each segment, in order of these.
+    pub places: Vec<ConflictArea>,
+}
+
+impl Crossing {
+    /// Its conflict area on a segment, if it has one there.
+    pub fn area_on(&self, segment: u32) -> Option<&ConflictArea> {
+        self.places.iter().find(|area| area.segment == segment)
+    }
+}
+
+/// Where the conflict area of a crossing is on a segment.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ConflictArea {
+    /// Index in [`Zone::segments`].
+    pub segment: u32,
+    /// Where it begins, from the segment's start, m.
+    pub from_m: f64,
+    /// Its extent along the paths over the segment, m.
     pub length_m: f64,
-    /// Where it begins on each segment: index in [`Zone::segments`], and distance from its start, m.
-    pub places: Vec<(u32, f64)>,
 }
 
 /// How a coordinator decides who passes a conflict point first.

@@ -276,7 +276,7 @@ impl Scene<'_> {
                 let theirs = self.conflicts.uses(other.path).iter().find(|u| u.point == own.point);
                 let Some(theirs) = theirs.filter(|theirs| !theirs.on_lane_of(own)) else { return false };
                 let length_m = self.kinds[usize::from(other.kind)].length_m;
-                if other.x_m >= theirs.at_m + clear_m(point, length_m) {
+                if other.x_m >= theirs.at_m + clear_m(point, theirs, length_m) {
                     return false;
                 }
                 if other.x_m >= theirs.at_m {
@@ -287,7 +287,7 @@ impl Scene<'_> {
                     other_m: theirs.at_m - other.x_m,
                     other_box_m: theirs.box_m - other.x_m,
                     is_inside,
-                    clear_m: driver.vehicle.length_m + point.area_m,
+                    clear_m: driver.vehicle.length_m + own.area_m,
                 };
                 match human.yields {
                     Yielding::Order => self.places[index] < self.places[at],
@@ -358,7 +358,7 @@ impl Scene<'_> {
     fn stands_in_the_way(&self, car: &Car, other: &Car) -> bool {
         let length_m = self.kinds[usize::from(car.kind)].length_m;
         self.conflicts.uses(car.path).iter().any(|own| {
-            let to_m = own.at_m + clear_m(&self.conflicts.points()[own.point as usize], length_m);
+            let to_m = own.at_m + clear_m(&self.conflicts.points()[own.point as usize], own, length_m);
             let theirs = self.conflicts.uses(other.path).iter().find(|u| u.point == own.point);
             (own.at_m..to_m).contains(&car.x_m)
                 && theirs.is_some_and(|theirs| !theirs.on_lane_of(own) && other.x_m < theirs.at_m)

@@ -8,7 +8,7 @@
 
 use super::car::Car;
 use super::role::World;
-use crate::conflict::{Conflicts, PointKind, Run};
+use crate::conflict::{Conflicts, PointKind, Run, Use};
 use crate::lists::Lists;
 use crate::scenario::{Scenario, VehicleParams};
 use crate::vehicle::Held;
@@ -23,6 +23,8 @@ const TOLERANCE_M: f64 = 1e-9;
 pub struct OverlapSummary {
     /// Pairs of vehicles that overlapped at any instant.
     pub pairs: u64,
+    /// Those of them of which neither was commanded.
+    pub pairs_uncommanded: u64,
     /// Samples at which a pair did, over all pairs.
     pub samples: u64,
     /// Time for which pairs did, over all pairs, s.
@@ -72,6 +74,7 @@ struct Look<'a> {
 #[derive(Clone, Copy)]
 struct Body<'a> {
     vehicle: u32,
+    is_commanded: bool,
     length_m: f64,
     motion: &'a Held,
 }
@@ -130,17 +133,18 @@ impl Overlaps {
         }
         let apart_m = b.motion.x0_m + shift_m - a.motion.x0_m;
         let at_sample = from_s == 0.0 && apart_m.abs() < body_m;
-        self.note(look, [a.vehicle, b.vehicle], time_s, whole_m - least_m, at_sample);
+        self.note(look, [a, b], time_s, whole_m - least_m, at_sample);
     }
 
-    fn note(&mut self, look: Look<'_>, [a, b]: [u32; 2], time_s: f64, depth_m: f64, at_sample: bool) {
-        let pair = [a.min(b), a.max(b)];
+    fn note(&mut self, look: Look<'_>, [a, b]: [Body<'_>; 2], time_s: f64, depth_m: f64, at_sample: bool) {
+        let pair = [a.vehicle.min(b.vehicle), a.vehicle.max(b.vehicle)];
         let seen = &mut self.summary;
         seen.time_s += time_s;
         seen.deepest_m = seen.deepest_m.max(depth_m);
         seen.samples += u64::from(at_sample);
         if self.pairs.insert(pair) {
             seen.pairs += 1;
+            seen.pairs_uncommanded += u64::from(!a.is_commanded && !b.is_commanded);
             seen.first.get_or_insert_with(|| FirstOverlap {
                 step: look.step,
                 zone: look.scenario.network.zones[look.zone].name.clone(),
@@ -280,7 +284,8 @@ impl World {
 
 impl Look<'_> {
     fn body<'a>(&self, car: &Car, motion: &'a Held) -> Body<'a> {
-        Body { vehicle: car.vehicle, length_m: self.kinds[usize::from(car.kind)].length_m, motion }
+        let Car { vehicle, is_commanded, kind, .. } = *car;
+        Body { vehicle, is_commanded, length_m: self.kinds[usize::from(kind)].length_m, motion }
     }
 }
 
@@ -316,14 +321,14 @@ fn compare_in_zone(
         let point = &conflicts.points()[here.point as usize];
         let there = conflicts.uses(other.path).iter().find(|u| u.point == here.point && !u.on_lane_of(here));
         let (PointKind::Crossing, Some(there)) = (point.kind, there) else { continue };
-        let inside = |body: &Body<'_>, from_m: f64| {
-            time_between(body.motion, from_m, from_m + point.area_m + body.length_m, look.dt_s)
+        let inside = |body: &Body<'_>, at: &Use| {
+            time_between(body.motion, at.at_m, at.at_m + at.area_m + body.length_m, look.dt_s)
         };
-        let (own_in, other_in) = (inside(&own, here.at_m), inside(&theirs, there.at_m));
+        let (own_in, other_in) = (inside(&own, here), inside(&theirs, there));
         let (from_s, to_s) = (own_in.0.max(other_in.0), own_in.1.min(other_in.1));
         if to_s - from_s > TOLERANCE_M {
             let depth_m = own.length_m.min(theirs.length_m);
-            overlaps.note(look, [own.vehicle, theirs.vehicle], to_s - from_s, depth_m, from_s == 0.0);
+            overlaps.note(look, [own, theirs], to_s - from_s, depth_m, from_s == 0.0);
         }
     }
 }

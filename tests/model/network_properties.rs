@@ -176,7 +176,13 @@ fn network(raw: &[RawZone]) -> Network {
                 Source::Road(road)
             });
             let name = format!("a{at}");
-            segments.push(Lane { name: name.clone(), length_m, source: Some(source), shape: Vec::new() });
+            segments.push(Lane {
+                name: name.clone(),
+                length_m,
+                source: Some(source),
+                shape: Vec::new(),
+                keep_clear: false,
+            });
             paths.push(Path { name, segments: vec![at as u32], exit: 0, length_m, share: 1.0 });
         }
         // Feedback needs a zone downstream, as the loader demands.

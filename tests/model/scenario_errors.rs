@@ -794,6 +794,60 @@ fn every_seed_runs_and_those_with_a_trace_have_it() {
     assert!(message.contains("roads.main1.demand.rates: missing key; expected trace and rates"), "{message}");
 }
 
+/// Crossings, and what is to be kept clear: a line of the junction, its replacement, and the message.
+const CROSSING_CASES: &[(&str, &str, &str)] = &[
+    (
+        "at = { across = 10, on = [12, 15.5] }",
+        "at = { across = 10, on = [12, 12.05] }",
+        "s.toml:25: zones.junction.crossings.c.at.on.1 = 12.05: expected the area's end: a length from 0.1 to 1000 m behind its beginning",
+    ),
+    (
+        "at = { across = 10, on = [12, 15.5] }",
+        "at = { across = 10, on = [31, 35] }",
+        "s.toml:25: zones.junction.crossings.c.at.on.0 = 31: expected a distance from 0 to 30 m, the segment's length",
+    ),
+    (
+        "at = { across = 10, on = [12, 15.5] }",
+        "at = { across = 10, on = [1, 2, 3] }",
+        "s.toml:25: zones.junction.crossings.c.at.on = [1, 2, 3]: expected a distance from 0 to 30 m, the segment's length, or two \
+         between which the area is",
+    ),
+    (
+        "length_m = 4, at",
+        "at",
+        "s.toml:25: zones.junction.crossings.c.length_m: missing key; expected a length from 0.1 to 1000 m",
+    ),
+    (
+        "road = \"west\" }",
+        "road = \"west\", keep_clear = true }",
+        "s.toml:15: zones.junction.segments.west.keep_clear = true: expected a segment that is no entrance: vehicles wait before it",
+    ),
+    (
+        "keep_clear = true },",
+        "keep_clear = 1 },",
+        "s.toml:17: zones.junction.segments.on.keep_clear = 1: expected true or false",
+    ),
+];
+
+#[test]
+fn bad_crossings() {
+    let junction = "[[zones]]\nname = \"junction\"\nsegments = [\n{ name = \"west\", length_m = 150, road = \"west\" },\n\
+                    { name = \"north\", length_m = 150, road = \"north\" },\n\
+                    { name = \"on\", length_m = 30, keep_clear = true },\n{ name = \"across\", length_m = 30 },\n]\npaths = [\n\
+                    { name = \"w\", segments = [\"west\", \"across\"], exit = \"e\" },\n\
+                    { name = \"n\", segments = [\"north\", \"on\"], exit = \"s\" },\n]\n\
+                    crossings = [\n{ name = \"c\", length_m = 4, at = { across = 10, on = [12, 15.5] } },\n]\n";
+    let (head, rest) = BASE.split_once("[[roads]]").unwrap();
+    let roads = format!("[[roads]]{}", rest.split_once("[[zones]]").unwrap().0);
+    let text = format!("{head}{junction}{roads}");
+    assert_eq!(Dir::new(&text, TRACE).message(&[], None), "no error");
+    check(CROSSING_CASES.iter().map(|(from, to, expected)| {
+        assert!(text.contains(from), "{from}");
+        let message = Dir::new(&text.replacen(from, to, 1), TRACE).message(&[], None);
+        (format!("{from} -> {to}"), message, (*expected).to_owned())
+    }));
+}
+
 #[test]
 fn a_cycle_is_named() {
     let zone = |name: &str, from: &str| {

@@ -113,8 +113,10 @@ impl NetworkView {
             let points = (0..).zip(conflicts.points()).map(|(at, point)| PointView {
                 name: point.name.clone(),
                 kind: if point.kind == PointKind::Merge { "merge" } else { "crossing" },
-                area_m: point.area_m,
-                place: conflicts.first_use(at).map(|(path, at_m)| shapes.on_path(network, id, path, at_m)),
+                area_m: conflicts.first_use(at).map_or(0.0, |(_, passes)| passes.area_m),
+                place: conflicts
+                    .first_use(at)
+                    .map(|(path, passes)| shapes.on_path(network, id, path, passes.at_m)),
             });
             ZoneView {
                 name: zone.name.clone(),

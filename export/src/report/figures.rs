@@ -192,8 +192,8 @@ fn time_space<DB: DrawingBackend>(
     for u in conflicts.uses(path) {
         let point = &conflicts.points()[u.point as usize];
         let color = if point.kind == PointKind::Merge { MERGE } else { CROSSING };
-        if point.area_m > 0.0 {
-            let area = [(0.0, u.at_m), (run.end_s, (u.at_m + point.area_m).min(length_m))];
+        if u.area_m > 0.0 {
+            let area = [(0.0, u.at_m), (run.end_s, (u.at_m + u.area_m).min(length_m))];
             chart.draw_series([Rectangle::new(area, color.mix(0.18).filled())])?;
         }
         chart.draw_series(DashedLineSeries::new(
@@ -607,8 +607,12 @@ impl<'a> Map<'a> {
         for zone in 0..network.zones.len() as u32 {
             let conflicts = Conflicts::of(network, zone);
             for (at, point) in (0..).zip(conflicts.points()) {
-                let Some((path, at_m)) = conflicts.first_use(at) else { continue };
-                points.push((shapes.on_path(network, zone, path, at_m), point.kind, point.name.clone()));
+                let Some((path, passes)) = conflicts.first_use(at) else { continue };
+                points.push((
+                    shapes.on_path(network, zone, path, passes.at_m),
+                    point.kind,
+                    point.name.clone(),
+                ));
             }
         }
         let (mut braked, mut stuck) = (Vec::new(), Vec::new());

@@ -5,7 +5,8 @@ use super::sections;
 use super::table::{Field, Table, unique_names};
 use crate::scenario::network::entrance_without_way_out;
 use crate::scenario::{
-    Crossing, Downstream, Exit, FlowPolicy, LawKind, PassingOrder, Path, Segment, Source, Zone, keys, ranges,
+    ConflictArea, Crossing, Downstream, Exit, FlowPolicy, LawKind, PassingOrder, Path, Segment, Source, Zone,
+    keys, ranges,
 };
 
 /// Name of the one exit of a zone in the short form.
@@ -152,7 +153,13 @@ fn short<'a>(table: &Table<'a>, mut zone: Zone, step_m: f64) -> Result<Shape<'a>
         t.only_declared(keys::APPROACHES)?;
         let length_m = t.f64("length_m", &is_length, &expected)?;
         let name = name.to_owned();
-        zone.segments.push(Segment { name: name.clone(), length_m, source: None, shape: Vec::new() });
+        zone.segments.push(Segment {
+            name: name.clone(),
+            length_m,
+            source: None,
+            shape: Vec::new(),
+            keep_clear: false,
+        });
         zone.paths.push(Path { name, segments: vec![index as u32], exit: 0, length_m, share: 1.0 });
     }
     zone.exits.push(Exit { name: ONLY_EXIT.to_owned(), to: None, flow: FlowPolicy::None });
@@ -287,7 +294,11 @@ fn segment(t: &Table<'_>, name: &str) -> Result<Segment, ScenarioError> {
             field.bad_because(Some(format!("it is {length_m} m long")), &ranges::SEGMENT_LENGTH.to_string())
         );
     }
-    Ok(Segment { name: name.to_owned(), length_m, source: None, shape })
+    let keep_clear = t.flag(&keys::KEEP_CLEAR)?;
+    if keep_clear && is_entrance(t) {
+        return Err(t.need("keep_clear", "")?.bad("a segment that is no entrance: vehicles wait before it"));
+    }
+    Ok(Segment { name: name.to_owned(), length_m, source: None, shape, keep_clear })
 }
 
 fn crossing(
@@ -297,10 +308,12 @@ fn crossing(
     segment_names: &[&str],
 ) -> Result<Crossing, ScenarioError> {
     t.only_declared(keys::CROSSINGS)?;
-    const AT: &str = "a table of places such as {north = 12.5, west = 8}, at least two";
-    let length_m = t.within("length_m", &ranges::CROSSING_LENGTH)?;
+    const AT: &str = "a table of places such as {north = 12.5, west = [8, 12]}, at least two";
     let field = t.need("at", AT)?;
-    let mut places: Vec<(u32, f64)> = Vec::new();
+    let mut places: Vec<ConflictArea> = Vec::new();
+    if t.get("length_m").is_some() {
+        t.within("length_m", &ranges::CROSSING_LENGTH)?;
+    }
     for (key, place) in field.table(AT)?.entries() {
         let Some(segment) = segment_names.iter().position(|n| *n == key) else {
             let hint = nearest(key, segment_names.iter().copied());
@@ -310,23 +323,37 @@ fn crossing(
             );
         };
         let longest_m = zone.segments[segment].length_m;
-        let at_m = place.f64(
-            |m| (0.0..=longest_m).contains(&m),
-            &format!("a distance from 0 to {longest_m} m, the segment's length"),
-        )?;
-        places.push((segment as u32, at_m));
+        let from = format!("a distance from 0 to {longest_m} m, the segment's length");
+        let from_m = |field: &Field<'_>| field.f64(|m| (0.0..=longest_m).contains(&m), &from);
+        let segment = segment as u32;
+        places.push(match &place.items("").unwrap_or_default()[..] {
+            [] => {
+                let from_m = from_m(&place)?;
+                ConflictArea { segment, from_m, length_m: t.within("length_m", &ranges::CROSSING_LENGTH)? }
+            }
+            [first, last] => {
+                let from_m = from_m(first)?;
+                let long = &ranges::CROSSING_LENGTH;
+                let to_m = last.f64(
+                    |m| long.contains(m - from_m),
+                    &format!("the area's end: {long} behind its beginning"),
+                )?;
+                ConflictArea { segment, from_m, length_m: to_m - from_m }
+            }
+            _ => return Err(place.bad(&format!("{from}, or two between which the area is"))),
+        });
     }
-    places.sort_by_key(|(segment, _)| *segment);
+    places.sort_by_key(|area| area.segment);
     if places.len() < 2 {
         return Err(field.bad(AT));
     }
     for path in &zone.paths {
-        if places.iter().filter(|(segment, _)| path.segments.contains(segment)).count() > 1 {
+        if places.iter().filter(|area| path.segments.contains(&area.segment)).count() > 1 {
             let problem = Some(format!("path {} uses two of them", path.name));
             return Err(field.bad_because(problem, "segments that no path shares"));
         }
     }
-    Ok(Crossing { name: name.to_owned(), length_m, places })
+    Ok(Crossing { name: name.to_owned(), places })
 }
 
 /// Who uses which exit and which road, by indices as declared.

@@ -87,7 +87,9 @@ fn zone() -> impl Strategy<Value = RawZone> {
     let lengths = |count| prop::collection::vec(20.0..150.0_f64, count);
     let path = (0..3usize, 0..3usize, prop::option::of(0..2usize), 0..3usize, 0.2..1.0_f64)
         .prop_map(|(entrance, inner, last, exit, share)| RawPath { entrance, inner, last, exit, share });
-    let crossing = ((0..8usize, 0..8usize), (0.0..1.0_f64, 0.0..1.0_f64), 1.0..8.0_f64)
+    // Where they begin at the beginnings of segments, these may be ways that part.
+    let at = prop_oneof![3 => (0.0..1.0_f64, 0.0..1.0_f64), 1 => Just((0.0, 0.0))];
+    let crossing = ((0..8usize, 0..8usize), at, 1.0..8.0_f64)
         .prop_map(|(segments, at, length_m)| RawCrossing { segments, at, length_m });
     let exit = (0..6usize, 0..6usize, prop_oneof![2 => Just(0.0), 1 => 20.0..120.0_f64])
         .prop_map(|(kind, to, link_m)| RawExit { kind, to, link_m });

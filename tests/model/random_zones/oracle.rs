@@ -1,7 +1,7 @@
 //! What must hold between any two vehicles, worked out from a network's shape and the passing order alone: without
 //! duties, conflict points or safe sets in closed form, step by step from what frames say.
 
-use control_zones::scenario::{Network, Path, Scenario, Segment, Zone};
+use control_zones::scenario::{Crossing, Network, Path, Scenario, Segment, Zone};
 use ipc_schemas::{NO_ZONE, STATE_ENTERED, VehicleState};
 use std::collections::{HashMap, HashSet};
 
@@ -123,10 +123,35 @@ fn stretches(zone: &Zone, own: u32, other: u32) -> Vec<Stretch> {
     for (i, s) in a.segments.iter().enumerate() {
         if let Some(j) = b.segments.iter().position(|t| t == s) {
             let Segment { length_m, .. } = zone.segments[*s as usize];
-            found.push(Stretch { own_m: a_starts[i], other_m: b_starts[j], length_m });
+            let near_m = near_m(zone, a.segments.get(i + 1), b.segments.get(j + 1));
+            found.push(Stretch { own_m: a_starts[i], other_m: b_starts[j], length_m: length_m + near_m });
         }
     }
     found
+}
+
+/// Whether ways part at a crossing: behind one segment, at the beginnings of theirs.
+fn parts(zone: &Zone, crossing: &Crossing) -> bool {
+    let mut before = HashSet::new();
+    for area in &crossing.places {
+        for path in &zone.paths {
+            for (at, segment) in path.segments.iter().enumerate() {
+                if *segment == area.segment {
+                    before.insert(if at == 0 { None } else { Some(path.segments[at - 1]) });
+                }
+            }
+        }
+    }
+    before.len() == 1 && !before.contains(&None) && crossing.places.iter().all(|area| area.from_m == 0.0)
+}
+
+/// For how long two ways that part are near each other behind that, on the first of them.
+fn near_m(zone: &Zone, own: Option<&u32>, other: Option<&u32>) -> f64 {
+    let (Some(own), Some(other)) = (own, other) else { return 0.0 };
+    let has = |crossing: &&Crossing, segment| crossing.places.iter().any(|area| area.segment == segment);
+    let mut crossings = zone.crossings.iter().filter(|crossing| parts(zone, crossing));
+    let found = crossings.find(|c| own != other && has(c, *own) && has(c, *other));
+    found.map_or(0.0, |c| c.places.iter().find(|area| area.segment == *own).map_or(0.0, |area| area.length_m))
 }
 
 fn crossings(zone: &Zone, own: u32, other: u32) -> Vec<Cross> {
@@ -136,12 +161,12 @@ fn crossings(zone: &Zone, own: u32, other: u32) -> Vec<Cross> {
         Some(starts(zone, path)[at])
     };
     let mut found = Vec::new();
-    for crossing in &zone.crossings {
-        for &(a, a_m) in &crossing.places {
-            for &(b, b_m) in crossing.places.iter().filter(|(b, _)| *b != a) {
-                if let (Some(own_m), Some(other_m)) = (place(own, a), place(other, b)) {
-                    let length_m = crossing.length_m;
-                    found.push(Cross { own_m: own_m + a_m, other_m: other_m + b_m, length_m });
+    for crossing in zone.crossings.iter().filter(|crossing| !parts(zone, crossing)) {
+        for a in &crossing.places {
+            for b in crossing.places.iter().filter(|b| b.segment != a.segment) {
+                if let (Some(own_m), Some(other_m)) = (place(own, a.segment), place(other, b.segment)) {
+                    let length_m = b.length_m;
+                    found.push(Cross { own_m: own_m + a.from_m, other_m: other_m + b.from_m, length_m });
                 }
             }
         }
