@@ -7,7 +7,7 @@
 //! under `u_min`, and in both the set of admissible accelerations of a step is an interval that begins at
 //! `u_min`. So the projection always exists, and it is one number. The derivation is in `docs/shield.md`.
 
-use crate::conflict::{Conflicts, Duties, DutyKind, Row as Vehicle};
+use crate::conflict::{Conflicts, Duties, DutyKind, Row as Vehicle, stands_on};
 use crate::scenario::VehicleParams;
 use crate::vehicle::Held;
 
@@ -313,7 +313,7 @@ impl Shield {
 }
 
 /// Whether a vehicle may be told to let another pass first: by how much it is inside the safe sets of all it then owes
-/// to it, m; infinite when the two do not meet.
+/// to it, m; infinite when the two do not meet, negatively so where it stands on a point that the other has yet to pass.
 pub fn yielding_slack_m(
     shield: &Shield,
     conflicts: &Conflicts,
@@ -321,6 +321,9 @@ pub fn yielding_slack_m(
     first: &Vehicle,
     second: &Vehicle,
 ) -> f64 {
+    if stands_on(conflicts, second, first) {
+        return f64::NEG_INFINITY;
+    }
     duties.derive(conflicts, &[*first, *second]);
     let slack = |duty: &crate::conflict::Duty| {
         let Some(kind) = duty.in_force(second.x_m, first.x_m) else { return f64::INFINITY };

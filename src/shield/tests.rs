@@ -46,6 +46,41 @@ fn who_has_room_is_plainly_admitted() {
     }
 }
 
+/// Whoever stands on a crossing cannot let those pass that have yet to come over it, wherever else it could wait for them.
+#[test]
+fn who_stands_on_a_crossing_lets_nobody_pass_it() {
+    let scenario = crate::scenario::load_embedded("intersection", &[], None).unwrap();
+    let conflicts = Conflicts::of(&scenario.network, 0);
+    let (own, shield) = (&scenario.vehicle, Shield::new(&scenario.vehicle, 0.1));
+    let mut duties = Duties::default();
+    let mut tried = 0;
+    for path in 0..scenario.network.zones[0].paths.len() as u32 {
+        for passes in conflicts.uses(path).iter().filter(|u| u.area_m > 0.0) {
+            let others = (0..).zip(&scenario.network.zones[0].paths).map(|(other, _)| other);
+            for other in others.filter(|other| *other != path) {
+                let theirs = conflicts.uses(other).iter().find(|u| u.point == passes.point);
+                let Some(theirs) = theirs.filter(|theirs| !theirs.on_lane_of(passes)) else { continue };
+                let at = |path, x_m| Vehicle { path, x_m, ..Vehicle::new(own, own, 0) };
+                let first = at(other, theirs.at_m - 5.0);
+                let mut slack_m = |x_m| {
+                    yielding_slack_m(
+                        &shield,
+                        &conflicts,
+                        &mut duties,
+                        &first,
+                        &Vehicle { id: 1, ..at(path, x_m) },
+                    )
+                };
+                assert_eq!(slack_m(passes.at_m + 0.1), f64::NEG_INFINITY);
+                assert_eq!(slack_m(passes.at_m + passes.area_m + own.length_m - 0.1), f64::NEG_INFINITY);
+                assert!(slack_m(passes.at_m - 60.0) > 0.0);
+                tried += 1;
+            }
+        }
+    }
+    assert!(tried > 10, "{tried}");
+}
+
 proptest! {
     #![proptest_config(ProptestConfig { cases: 4000, max_global_rejects: 100_000, ..ProptestConfig::default() })]
 
