@@ -172,10 +172,16 @@ impl Summary {
     fn overlap_line(&self) -> Option<String> {
         let o = &self.overlaps;
         let first = o.first.as_ref()?;
+        let among = match o.pairs_uncommanded {
+            0 => String::new(),
+            all if all == o.pairs => " that nobody commands".to_owned(),
+            some => format!(" ({some} of them of two that nobody commands)"),
+        };
         Some(format!(
-            "bodies overlapped: {} of vehicles, {:.2} s in all ({}), by up to {:.2} m; first {} and {} in {} at \
+            "bodies overlapped: {} of vehicles{}, {:.2} s in all ({}), by up to {:.2} m; first {} and {} in {} at \
              {:.1} s",
             number(o.pairs, "pair"),
+            among,
             o.time_s,
             number(o.samples, "sample"),
             o.deepest_m,
@@ -303,12 +309,13 @@ impl Summary {
         if let Some(t) = &self.traffic {
             text.push_str(&format!(
                 "moved by {}: accelerations within {:.3} m/s² of what was to be held, positions within {:.4} m of the mean \
-                 acceleration's; {} commanded by nobody, {} taken out within a zone\n",
+                 acceleration's; {} commanded by nobody, {} taken out within a zone, {} come behind an exit\n",
                 t.name,
                 t.greatest_disobedience_mps2,
                 t.greatest_deviation_m,
                 number(t.uncommanded.into(), "vehicle"),
-                t.gone
+                t.gone,
+                t.behind_exits
             ));
         }
         if let Some(p) = &self.punctuality {

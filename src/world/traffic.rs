@@ -43,10 +43,13 @@ impl Done {
 
 /// A vehicle that a traffic has brought in during the step. Vehicles are numbered in the order in which they come, from
 /// 0 over the run.
+///
+/// One that is put behind the end of its path, by an exit that leads out of the network, never was in the zone, and counts as
+/// having left it: those who leave by that exit keep behind it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[repr(C)]
 pub struct Newcomer {
-    /// Position on its path at the end of the step, m.
+    /// Position on its path at the end of the step, m; from the path's length on, behind the exit.
     pub x_m: f64,
     /// Speed at the end of the step, m/s.
     pub v_mps: f64,
@@ -172,6 +175,8 @@ pub struct TrafficSummary {
     pub gone: u32,
     /// Vehicles in zones that nobody commanded.
     pub uncommanded: u32,
+    /// Vehicles that came behind a zone's exit, in the way of those that leave by it.
+    pub behind_exits: u32,
     /// Greatest distance by which a vehicle came elsewhere over a step than with its mean acceleration, m: how much what is
     /// said of instants between samples may be wrong.
     pub greatest_deviation_m: f64,
@@ -196,6 +201,8 @@ pub(super) struct Played {
 
 /// One that is there no more counts as having left its zone so far ahead of all others, m.
 const OUT_OF_SIGHT_M: f64 = 1e6;
+/// Newcomers further behind an exit than this concern nobody in its zone, m.
+const MOST_BEHIND_M: f64 = 1e3;
 /// A vehicle that comes back so little, m, has not: rounding.
 const BACK_M: f64 = 1e-6;
 /// One that begins a step so slowly backwards, m/s, starts from a standstill: rounding.
@@ -381,11 +388,19 @@ impl World {
         let Some(mut played) = self.played.take() else { return Ok(()) };
         let ways = Ways::of(scenario);
         let result = played.newcomers.iter().try_for_each(|newcomer| {
-            let way = way_of(newcomer, scenario, &ways, self.arrived)?;
-            let id = self.arrived;
+            let id = self.arrived + played.summary.behind_exits;
+            let way = way_of(newcomer, scenario, &ways, id)?;
+            let Newcomer { x_m, v_mps, zone, path, .. } = *newcomer;
+            if x_m >= self.lengths_m[zone as usize][path as usize] {
+                played.summary.behind_exits += 1;
+                let mut car = Car::arriving(id, way, newcomer.kind as u16, now_s + dt_s, v_mps);
+                (car.x_m, car.is_commanded) = (x_m, newcomer.is_commanded != 0);
+                self.has_humans |= !car.is_commanded;
+                self.put_behind_exit(zone, car);
+                return Ok(());
+            }
             self.arrived += 1;
             played.summary.uncommanded += u32::from(newcomer.is_commanded == 0);
-            let Newcomer { x_m, v_mps, zone, path, .. } = *newcomer;
             // One that was outside before the step has passed the origin in it.
             let inside_s =
                 if x_m <= v_mps * dt_s { if v_mps > 0.0 { x_m / v_mps } else { 0.0 } } else { 0.0 };
@@ -400,6 +415,31 @@ impl World {
         let result = result.map_err(|problem: String| played.failed(problem));
         self.played = Some(played);
         result
+    }
+
+    /// Puts one among those that have left the zone, behind whoever has come further by its exit.
+    fn put_behind_exit(&mut self, zone: ZoneId, mut car: Car) {
+        let at = zone as usize;
+        let exit = self.conflicts[at].exit(car.path);
+        car.beyond = Beyond { zone, exit, next_exit: 0 };
+        let behind_m = |car: &Car| car.x_m - self.lengths_m[at][car.path as usize];
+        let first = self.zones[at].first();
+        let is_nearer =
+            |other: &Car| self.conflicts[at].exit(other.path) == exit && behind_m(other) < behind_m(&car);
+        let place = self.cars[at][..first].iter().position(is_nearer).unwrap_or(first);
+        self.cars.push(at, car);
+        self.cars[at][place..].rotate_right(1);
+        self.left += 1;
+        self.zones[at].left += 1;
+        self.zones[at].left_now = true;
+        self.note_event(zone);
+    }
+
+    /// Has a zone an event in the step just ended.
+    fn note_event(&mut self, zone: ZoneId) {
+        if let Err(place) = self.events.binary_search(&zone) {
+            self.events.insert(place, zone);
+        }
     }
 
     /// Takes out of their zones who is there no more, and tells the traffic whom the gates have let in.
@@ -452,9 +492,7 @@ impl World {
         self.left += 1;
         self.zones[at].left += 1;
         self.zones[at].left_now = true;
-        if let Err(place) = self.events.binary_search(&zone) {
-            self.events.insert(place, zone);
-        }
+        self.note_event(zone);
     }
 }
 
@@ -494,8 +532,12 @@ fn way_of(newcomer: &Newcomer, scenario: &Scenario, ways: &Ways<'_>, vehicle: u3
     let Some(length_m) = shape.paths.get(path as usize).map(|path| path.length_m) else {
         return wrong("path", &path, format!("less than {} in {}", shape.paths.len(), shape.name));
     };
-    if !(0.0..length_m).contains(&x_m) {
-        return wrong("x_m", &x_m, format!("from 0 to less than {length_m}, the length of its path"));
+    let (behind_m, why) = match shape.exit_of(path).to {
+        None => (MOST_BEHIND_M, "the length of its path, and what is behind its exit"),
+        Some(_) => (0.0, "the length of its path, whose exit leads to another zone"),
+    };
+    if !(0.0..length_m + behind_m).contains(&x_m) {
+        return wrong("x_m", &x_m, format!("from 0 to less than {}, {why}", length_m + behind_m));
     }
     if !(v_mps >= 0.0 && v_mps.is_finite()) {
         return wrong("v_mps", &v_mps, "a number >= 0".to_owned());

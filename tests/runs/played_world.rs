@@ -170,6 +170,45 @@ fn who_stands_and_waits_is_not_waited_for() {
     assert_eq!(summary.zones[0].orders_refused, 0);
 }
 
+/// Whoever comes to stand behind an exit, without ever having been in the zone, is stopped for by those that are to leave by it.
+#[test]
+fn who_comes_behind_an_exit_is_in_the_way_of_those_that_leave_by_it() {
+    let scenario = scenario("intersection", &["end.time_s=60", "shield=on", "coordination.order=fifo"]);
+    let length_m = scenario.network.zones[0].paths[0].length_m;
+    let traffic = Scripted {
+        coming: vec![
+            (0, newcomer(0, length_m - 100.0, 12.0, 1)),
+            (1, newcomer(0, length_m + 5.5, 0.0, 0)),
+            // Further ahead: it is the one before that matters.
+            (2, newcomer(0, length_m + 30.0, 0.0, 0)),
+        ],
+        going: vec![(400, 1)],
+        ..Scripted::default()
+    };
+    let mut run = InProcess::played(&scenario, 1, 1, Box::new(traffic), false);
+    let mut stands_m = f64::NAN;
+    while run.step().unwrap() {
+        for state in run.world().records().filter(|state| state.vehicle > 0) {
+            assert!(state.has_left() && !state.is_commanded(), "{state:?}");
+        }
+        if run.world().step() == 400 {
+            let first = run.world().records().find(|state| state.vehicle == 0).unwrap();
+            assert!(first.v_mps < 1e-3, "{first:?}");
+            stands_m = first.x_m;
+        }
+    }
+    let summary = run.world().summary();
+    let traffic = summary.traffic.unwrap();
+    assert!(
+        stands_m > length_m - 10.0 && stands_m < length_m + 0.5,
+        "it stands at {stands_m} of {length_m} m"
+    );
+    // Once that one is gone it leaves, and stands behind the other nowhere: that is no business of the zone's.
+    assert_eq!((summary.arrived, summary.departed, traffic.behind_exits, traffic.uncommanded), (1, 1, 2, 0));
+    assert_eq!(summary.overlaps.pairs, 0);
+    assert!(summary.zones[0].min_rear_end_margin_m.unwrap() > -1e-9);
+}
+
 /// What a traffic says is checked, and what is wrong with it said in a line.
 #[test]
 fn what_cannot_be_is_refused() {

@@ -3,7 +3,7 @@
 use super::WorldRule;
 use crate::scenario::Scenario;
 use ipc_schemas::{self as frames, VehicleCommand, VehicleState};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 /// How far what happens may be from what was asked for.
@@ -69,12 +69,16 @@ impl Judge {
             }
         }
         let mut next = self.next;
-        for (&vehicle, state) in here.range(self.next..) {
+        // Those that come behind an exit have numbers, too.
+        let came: BTreeSet<u32> = states.iter().map(|state| state.vehicle).filter(|v| *v >= next).collect();
+        for vehicle in came {
             if vehicle != next {
                 note(WorldRule::Numbered, format!("vehicle {vehicle} came, expected {next}"));
             }
             next = vehicle + 1;
-            self.newcomer(state, states, note);
+            if let Some(state) = here.get(&vehicle) {
+                self.newcomer(state, states, note);
+            }
         }
         for (vehicle, state) in
             here.range(..self.next).filter(|(vehicle, _)| !self.last.contains_key(vehicle))
