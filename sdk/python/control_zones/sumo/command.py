@@ -42,6 +42,7 @@ def command(given: Sequence[str]) -> int:
     run.add_argument("--zone", action="append", default=[], metavar="JUNCTION[+JUNCTION…]", help="one, or several as one zone; may be repeated; default: all with conflicts, roundabouts as one")
     run.add_argument("--approach", type=float, default=150.0, metavar="M", help="so much of incoming lanes at most [150]")
     run.add_argument("--cav", action="append", default=[], metavar="TYPE", help="vehicle types that are automated [all]")
+    run.add_argument("--lights", choices=["off", "keep"], default="off", help="traffic lights of zones in which somebody is automated, who does not obey them [off: SUMO's drivers have the right of way of the network there]")
     run.add_argument("--scenario-out", metavar="FILE", help="keep the scenario that was made of the junctions")
     run.add_argument("--end", type=float, metavar="S", help="the run ends here [the configuration's end, or 3600]")
     again = commands.add_parser("scenario", help="a scenario of ours with SUMO as its world")
@@ -209,6 +210,8 @@ def conduct(
         "arrived": totals.arrived,
         "mean_travel_s": totals.travel_s / totals.arrived if totals.arrived else None,
         "collisions": totals.collisions,
+        "collided_pairs": len(totals.pairs),
+        "collided_pairs_automated": sum(count > 0 for count in totals.pairs.values()),
         "teleports": totals.teleports,
         "vehicle_steps": totals.vehicle_steps,
         "sumo_s": totals.sumo_s,
@@ -223,14 +226,19 @@ def conduct(
         elif args.json:
             with open(args.json, "w") as file:
                 json.dump(all_of_it, file, indent=2)
+    if totals.vehicle_steps == 0 and code != 0:
+        return code  # It has said why.
+    automated = f" ({said['collided_pairs_automated']} with an automated vehicle)" if totals.pairs else ""
+    pairs = "pair" if len(totals.pairs) == 1 else "pairs"
     mean = f", mean travel time {said['mean_travel_s']:.2f} s" if totals.arrived else ""
     print(
-        f"SUMO: {totals.departed} departed, {totals.arrived} arrived{mean}; {len(totals.collisions)} collisions, "
+        f"SUMO: {totals.departed} departed, {totals.arrived} arrived{mean}; {len(totals.pairs)} {pairs} collided{automated}, "
         f"{totals.teleports} teleports; of {wall_s:.2f} s {totals.sumo_s:.2f} were SUMO's own steps, "
         f"{totals.adapter_s:.2f} this package's, for {totals.vehicle_steps} vehicle-steps",
         file=sys.stderr,
     )
-    for collision in totals.collisions[:3]:
+    begins = {sample.split(": ", 1)[1]: sample for sample in reversed(totals.collisions)}
+    for collision in list(reversed(begins.values()))[:3]:
         print(f"SUMO: collision at {collision}", file=sys.stderr)
     return code
 

@@ -7,7 +7,7 @@ import typing
 import xml.etree.ElementTree as ElementTree
 
 from .._session import Error
-from .network import Zone, connect, incoming, is_narrow, word, zone_of
+from .network import Zone, connect, incoming, is_narrow, onward, word, zone_of
 from .scenario import Kind, text
 from .simulation import read_net
 
@@ -58,8 +58,24 @@ def limit(net: typing.Any, zones: Sequence[Zone]) -> float:
     return min([*to_them, *(zone.v_max_mps for zone in zones)])
 
 
+def slow(net: typing.Any, zones: Sequence[Zone]) -> str | None:
+    """What to say where the limit of all zones is well below that of some of their roads; `None` where it is not."""
+    lanes = {path.lanes[0][0]: zone for zone in zones for path in zone.paths}
+    limits = {name: float(net.getLane(name).getSpeed()) for name in lanes}
+    least_mps = limit(net, zones)
+    fast = sum(mps > 1.3 * least_mps for mps in limits.values())
+    if fast == 0:
+        return None
+    slowest = min(limits, key=lambda name: limits[name])
+    at = f"lane {slowest} to {lanes[slowest].name}" if limits[slowest] == least_mps else "a lane within a zone"
+    return (
+        f"in all zones vehicles drive at most {least_mps:.1f} m/s, the limit of {at}, though {fast} of {len(limits)} lanes to zones "
+        f"allow up to {max(limits.values()):.1f}: name junctions of faster roads only (--zone)"
+    )
+
+
 def with_conflicts(net: typing.Any) -> list[str]:
-    """Junctions at which ways meet, in order of their names; those of what SUMO knows as a roundabout together, where it
+    """Junctions at which ways of cars meet, in order of their names; those of what SUMO knows as a roundabout together, where it
     is narrow."""
     all_rings = [sorted(str(node) for node in ring.getNodes()) for ring in net.getRoundabouts()]
     rings = ["+".join(nodes) for nodes in all_rings if is_narrow(net, nodes)]
@@ -68,10 +84,11 @@ def with_conflicts(net: typing.Any) -> list[str]:
     for node in net.getNodes():
         if node.getID() in in_rings:
             continue
-        if len(incoming(net, str(node.getID()))) > 1 and node.getType() not in ("dead_end", "rail_signal"):
+        edges = incoming(net, str(node.getID()))
+        if sum(any(onward(net, lane) for lane in edge.getLanes()) for edge in edges) > 1:
             found.append(str(node.getID()))
     if not found:
-        raise Error("--zone: no junction of the network has two incoming roads")
+        raise Error("--zone: no junction of the network has two incoming roads for passenger cars")
     return sorted(found)
 
 

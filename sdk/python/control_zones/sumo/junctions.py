@@ -11,8 +11,8 @@ import libsumo
 
 from .._session import Error
 from ..world import GONE, Newcomer, Traffic
-from .importing import limit, with_conflicts
-from .network import Zone, too_short, word, zone_of
+from .importing import limit, slow, with_conflicts
+from .network import Zone, stopping_m, too_short, word, zone_of
 from .scenario import Kind, text
 from .simulation import Car, Simulation, is_automated, read_net
 
@@ -30,6 +30,14 @@ class Place(typing.NamedTuple):
     paths: tuple[tuple[int, float, tuple[str, ...]], ...]
 
 
+class Exit(typing.NamedTuple):
+    """A lane out of a zone: one of the paths that lead to it, and for how many metres those that leave must see who is on it."""
+
+    zone: int
+    path: int
+    near_m: float
+
+
 class JunctionTraffic(Traffic):
     """SUMO brings vehicles to junctions and moves them; those that are automated are driven there."""
 
@@ -37,11 +45,21 @@ class JunctionTraffic(Traffic):
     brings = True
 
     def __init__(
-        self, zones: Sequence[Zone], kinds: dict[str, int], simulation: Simulation, automated: typing.Callable[[str, str], bool]
+        self,
+        zones: Sequence[Zone],
+        kinds: dict[str, int],
+        simulation: Simulation,
+        automated: typing.Callable[[str, str], bool],
+        v_max_mps: float,
     ) -> None:
         self.zones, self.kinds, self.simulation, self.automated = zones, kinds, simulation, automated
         self.lanes: dict[str, Place] = {}
+        self.exits: dict[str, list[Exit]] = {}
+        near_m = stopping_m(v_max_mps)
         for index, zone in enumerate(zones):
+            out = {path.lanes[-1][0]: number for number, path in enumerate(zone.paths)}
+            for lane, number in out.items():
+                self.exits.setdefault(lane, []).append(Exit(index, number, near_m))
             over: dict[str, list[tuple[int, float, tuple[str, ...]]]] = {}
             for number, path in enumerate(zone.paths):
                 for at, (lane, at_m) in enumerate(path.lanes[:-1]):
@@ -54,6 +72,8 @@ class JunctionTraffic(Traffic):
         self.left: set[int] = set()
         #: By name, those who are in the network and in no zone.
         self.outside: dict[str, Car] = {}
+        #: Lanes out of zones on which somebody else may be the next to those that leave by them.
+        self.unsure: set[str] = set()
         self.count = 0
         self.is_automated: dict[str, bool] = {}
 
@@ -78,7 +98,8 @@ class JunctionTraffic(Traffic):
             asked = {number for _, number, _ in tasks}
             for number in [number for number in self.left if number not in asked]:
                 self.left.discard(number)
-                cars.pop(number, None)
+                if (car := cars.pop(number, None)) is not None:
+                    car.beyond = ""
         did: list[float] = []
         for _, number, is_held in tasks:
             car = cars.get(number)
@@ -87,10 +108,12 @@ class JunctionTraffic(Traffic):
                 if car is not None:
                     car.number = -1
                     del cars[number]
+                    self.unsure.add(car.lane)
                 continue
             if car.number == number:
                 car.x_m += car.advanced_m
                 if car.x_m >= car.length_m:
+                    car.lane = car.beyond = self.zones[car.zone].paths[car.path].lanes[-1][0]
                     self.leave(car)  # It is followed as long as it matters there.
                 elif not is_held and not self.is_where(car):
                     # One that is held changes no lanes.
@@ -113,11 +136,16 @@ class JunctionTraffic(Traffic):
         return place is not None and place.zone == car.zone and any(path == car.path for path, *_ in place.paths)
 
     def newcomers(self) -> list[Newcomer]:
-        """Those outside who are on a zone's lanes now: lane by lane, and from the back on each."""
+        """Those outside who are on a zone's lanes now: lane by lane, and from the back on each; and those who have come behind
+        a zone's exit otherwise than through it."""
         found = []
         lane_of, position_of = libsumo.vehicle.getLaneID, libsumo.vehicle.getLanePosition
         for name, car in self.outside.items():
             lane = lane_of(name)
+            if lane != car.lane:
+                # One that has left a lane hides nobody there any more.
+                self.unsure.update((car.lane, lane))
+                car.lane, car.beyond = lane, ""
             place = self.lanes.get(lane)
             if place is None:
                 continue
@@ -126,7 +154,34 @@ class JunctionTraffic(Traffic):
             if place.paths[0][1] + at_m >= 0.0:
                 found.append((self.rank[lane], at_m, lane, car))
         found.sort(key=lambda one: one[:2])
-        return [newcomer for _, at_m, lane, car in found if (newcomer := self.let_in(car, lane, at_m)) is not None]
+        behind = self.behind_exits() if self.unsure else []
+        return behind + [newcomer for _, at_m, lane, car in found if (newcomer := self.let_in(car, lane, at_m)) is not None]
+
+    def behind_exits(self) -> list[Newcomer]:
+        """Of lanes out of zones on which somebody may have come without having been in the zone, or was hidden by one that is
+        gone: who is the next there."""
+        known = {car.name: car for car in (*self.cars.values(), *self.outside.values())}
+        found = []
+        position_of = libsumo.vehicle.getLanePosition
+        for lane in sorted(self.unsure & self.exits.keys()):
+            on_it = libsumo.lane.getLastStepVehicleIDs(lane)
+            if not on_it:
+                continue
+            name = min(on_it, key=position_of)
+            car, at_m = known[name], position_of(name)
+            if car.beyond == lane or (car.number >= 0 and self.zones[car.zone].paths[car.path].lanes[-1][0] == lane):
+                continue
+            car.lane = car.beyond = lane
+            self.simulation.see(car)
+            for zone, path, near_m in self.exits[lane]:
+                if at_m < near_m:
+                    self.left.add(self.count)
+                    self.cars[self.count] = car
+                    self.count += 1
+                    x_m, kind = self.zones[zone].paths[path].length_m + at_m, self.kind(libsumo.vehicle.getTypeID(name))
+                    found.append(Newcomer(x_m, car.v_mps, zone, path, kind=kind, is_commanded=0))
+        self.unsure.clear()
+        return found
 
     def let_in(self, car: Car, lane: str, at_m: float) -> Newcomer | None:
         """Makes one a member of the zone whose lane it is on, unless it has as good as left that."""
@@ -178,6 +233,10 @@ def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation,
     ids = suitable(net, args.zone)
     zones = [zone_of(net, junction, args.approach) for junction in ids]
     kinds, index = fleet()
+    if (told := slow(net, zones)) is not None:
+        print(f"cz sumo: {told}", file=sys.stderr)
+    if args.lights == "off" and args.penetration > 0.0:
+        switch_off(zones)
     unknown = [name for name in args.cav if name not in index]
     if unknown:
         raise Error(f"--cav: there is no vehicle type {unknown[0]}, expected one of {', '.join(sorted(index))}")
@@ -202,8 +261,22 @@ def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation,
     def automated(name: str, kind: str) -> bool:
         return (not args.cav or kind in args.cav) and is_automated(seed, name, args.penetration)
 
-    traffic = JunctionTraffic(zones, index, simulation, automated)
+    traffic = JunctionTraffic(zones, index, simulation, automated, limit(net, zones))
     return traffic, simulation, ["run", path, "--in-process", *(f"--set={one}" for one in args.set)]
+
+
+def switch_off(zones: Sequence[Zone]) -> None:
+    """Switches off the traffic lights of zones: in them it is the coordinator who says who goes first, and a driver who starts at green expects
+    nobody from the side. SUMO's drivers then keep to the right of way that the network has without lights."""
+    entrances = {path.lanes[0][0] for zone in zones for path in zone.paths}
+    lights = libsumo.trafficlight
+    for light in lights.getIDList():
+        lanes = {lane for lane in lights.getControlledLanes(light) if not lane.startswith(":")}
+        if lanes and lanes <= entrances:
+            lights.setProgram(light, "off")
+        elif lanes & entrances:
+            others = ", ".join(sorted(lanes - entrances)[:3])
+            print(f"cz sumo: traffic light {light} stays on, as it rules {others} too, of no zone: automated vehicles do not obey it", file=sys.stderr)
 
 
 def suitable(net: typing.Any, named: list[str]) -> list[str]:

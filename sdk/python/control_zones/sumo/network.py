@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import typing
 from dataclasses import dataclass, field
@@ -17,6 +18,8 @@ Place = tuple[float, float]
 NEAR_M = 2.2
 #: What is reckoned with where it is asked whether vehicles have room to stop: m/s^2, s, m.
 BRAKING_MPS2, REACTION_S, ROOM_M = 4.5, 1.2, 6.5
+#: Letters that a name in a scenario may have.
+LONGEST = 64
 #: Distance between the places of a lane that are looked at, m.
 SAMPLE_M = 0.5
 
@@ -31,6 +34,8 @@ class Segment:
     road: str | None = None
     zone: tuple[str, str] | None = None
     link_m: float = 0.0
+    #: Within a junction, where nobody waits for others.
+    keep_clear: bool = False
 
 
 @dataclass
@@ -51,8 +56,8 @@ class Crossing:
     """Where two segments are too near to each other."""
 
     name: str
-    length_m: float
-    at: dict[str, float]
+    #: From where to where on each, m.
+    at: dict[str, tuple[float, float]]
 
 
 @dataclass
@@ -117,13 +122,18 @@ def incoming(net: typing.Any, junction: str) -> list[typing.Any]:
     return sorted((edge for edge in edges if edge.getFromNode().getID() not in nodes), key=lambda edge: str(edge.getID()))
 
 
+def stopping_m(v_mps: float, room_m: float = ROOM_M) -> float:
+    """The way that stopping takes, with what is kept beside it, m."""
+    return v_mps * v_mps / (2.0 * BRAKING_MPS2) + REACTION_S * v_mps + room_m
+
+
 def too_short(net: typing.Any, junction: str, room_m: float = ROOM_M) -> str | None:
     """What is wrong with a zone: a road on which vehicles cannot stop, and keep their distance, from one
     junction to the next; `None` when nothing is. `room_m` is kept beside the way that stopping takes."""
     for edge in incoming(net, junction):
         for lane in edge.getLanes():
             v_mps = float(lane.getSpeed())
-            needed_m = v_mps * v_mps / (2.0 * BRAKING_MPS2) + REACTION_S * v_mps + room_m
+            needed_m = stopping_m(v_mps, room_m)
             if lane.allows("passenger") and lane.getOutgoing() and float(lane.getLength()) < needed_m:
                 return f"lane {lane.getID()} to junction {junction} is {lane.getLength():.1f} m long, expected {needed_m:.1f} at {v_mps:.1f} m/s"
     return None
@@ -143,7 +153,7 @@ def onward(net: typing.Any, lane: typing.Any) -> list[tuple[Stretch, typing.Any]
         if not (lane.allows("passenger") and to.allows("passenger")) or any(to is known for _, known in found):
             continue
         start, end = word(lane.getID()), word(to.getID())
-        stretch = Stretch(f"{start[:30]}-{end[:30]}", start, end, 0.0, [], [])
+        stretch = Stretch(word(f"{start}-{end}"), start, end, 0.0, [], [])
         while via:
             inside = net.getLane(via)
             stretch.lanes.append((via, stretch.length_m))
@@ -195,30 +205,32 @@ def add_lane(
                 segments.append(stretch.name)
                 if stretch.name not in inner:
                     inner[stretch.name] = stretch
-                    zone.segments.append(Segment(stretch.name, stretch.length_m, stretch.shape))
+                    inside = stretch.start != stretch.end
+                    zone.segments.append(Segment(stretch.name, stretch.length_m, stretch.shape, keep_clear=inside))
             if stretch.start == stretch.end:
                 zone.v_max_mps = min(zone.v_max_mps, float(net.getLane(stretch.lanes[0][0]).getSpeed()))
         lanes.append((to.getID(), at_m))
-        name, exit_ = f"{entrance[:30]}-{word(to.getID())[:30]}", word(to.getID())
+        name, exit_ = word(f"{entrance}-{to.getID()}"), word(to.getID())
         alike = sum(path.name.split(".")[0] == name for path in zone.paths)
         zone.paths.append(Path(f"{name}.{alike}" if alike else name, segments, exit_, lanes, at_m))
     if begins:
         ends = cut(lane.getShape(), (length_m - own_m) / length_m)
-        zone.segments.append(Segment(entrance, own_m, ends, road=f"{zone.name}-{entrance}"))
+        zone.segments.append(Segment(entrance, own_m, ends, road=word(f"{zone.name}-{entrance}")))
 
 
 def crossings(zone: Zone, inner: dict[str, Stretch]) -> list[Crossing]:
     """Where stretches that no path shares are too near to each other.
 
     Ways to one lane merge at their ends, as scenarios have it; but bodies meet before that, so whoever waits is to wait
-    before the two ways come together. Ways from one lane part where it ends.
+    before the two ways come together. Ways from one lane part where it ends; but one that stops on its way there reaches
+    into the other's for as long as they are near each other, so that counts as a crossing too.
     """
     shared = {(one, other) for path in zone.paths for one in path.segments for other in path.segments}
     found: list[Crossing] = []
     stretches = list(inner.values())
     for index, one in enumerate(stretches):
         for other in stretches[index + 1 :]:
-            if one.start == other.start or (one.name, other.name) in shared:
+            if (one.name, other.name) in shared:
                 continue
             parts = near(one.shape, other.shape)
             if parts is None:
@@ -226,9 +238,8 @@ def crossings(zone: Zone, inner: dict[str, Stretch]) -> list[Crossing]:
             (from_m, to_m), (other_from_m, other_to_m) = parts
             # Shapes are a little longer or shorter than what SUMO says of their lanes.
             scale, other_scale = (stretch.length_m / length(stretch.shape) for stretch in (one, other))
-            area_m = max((to_m - from_m) * scale, (other_to_m - other_from_m) * other_scale, 0.1)
-            at = {one.name: from_m * scale, other.name: other_from_m * other_scale}
-            found.append(Crossing(f"c{len(found)}", area_m, at))
+            at = {one.name: (from_m * scale, to_m * scale), other.name: (other_from_m * other_scale, other_to_m * other_scale)}
+            found.append(Crossing(f"c{len(found)}", at))
     return found
 
 
@@ -289,8 +300,9 @@ def cut(line: Sequence[Place], share: float) -> list[Place]:
 
 
 def word(name: str) -> str:
-    """A name of SUMO's as scenarios may have them."""
-    return "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)[:64]
+    """A name of SUMO's as scenarios may have them: of these letters, and not too long; a long one ends with its hash."""
+    told = "".join(c if c.isascii() and (c.isalnum() or c in "_-") else "_" for c in name)
+    return told if len(told) <= LONGEST else f"{told[: LONGEST - 9]}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def connect(net: typing.Any, zones: Iterable[tuple[str, Zone]], least_m: float) -> None:

@@ -160,7 +160,7 @@ class Replica:
     def first_m(self, zone: int, inner: int) -> float:
         """How far behind the beginning of a segment vehicles may have to wait first: at a crossing, or where ways come together."""
         shape = self.network["zones"][zone]
-        crosses = [float(at_m) for crossing in shape["crossings"] for on, at_m in crossing["places"] if on == inner]
+        crosses = [float(area["from_m"]) for crossing in shape["crossings"] for area in crossing["places"] if area["segment"] == inner]
         return min([*crosses, float(shape["segments"][inner]["length_m"])])
 
     def legs_of(self, zone: int) -> list[Leg]:

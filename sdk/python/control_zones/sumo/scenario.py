@@ -10,6 +10,10 @@ if typing.TYPE_CHECKING:
     from .network import Zone
 
 
+#: The least extent of a crossing in a scenario, and a little, m.
+LEAST_M = 0.11
+
+
 class Kind(typing.NamedTuple):
     """A kind of vehicle: what of a SUMO vehicle type a scenario knows."""
 
@@ -98,7 +102,8 @@ def shape(zone: Zone) -> list[str]:
         elif segment.zone:
             link = f", link_m = {segment.link_m:.3f}" if segment.link_m else ""
             source = f', zone = "{segment.zone[0]}", exit = "{segment.zone[1]}"{link}'
-        lines.append(f'    {{ name = "{segment.name}", length_m = {segment.length_m:.6f}, shape = [{places}]{source} }},')
+        inner = ", keep_clear = true" if segment.keep_clear else ""
+        lines.append(f'    {{ name = "{segment.name}", length_m = {segment.length_m:.6f}, shape = [{places}]{source}{inner} }},')
     lines += ["]", "paths = ["]
     for path in zone.paths:
         lines.append(f'    {{ name = "{path.name}", segments = [{quoted(path.segments)}], exit = "{path.exit}" }},')
@@ -106,8 +111,8 @@ def shape(zone: Zone) -> list[str]:
         return [*lines, "]"]
     lines += ["]", "crossings = ["]
     for crossing in zone.crossings:
-        at = ", ".join(f'"{name}" = {at_m:.3f}' for name, at_m in crossing.at.items())
-        lines.append(f'    {{ name = "{crossing.name}", length_m = {crossing.length_m:.3f}, at = {{ {at} }} }},')
+        at = ", ".join(f'"{name}" = [{from_m:.3f}, {max(to_m, from_m + LEAST_M):.3f}]' for name, (from_m, to_m) in crossing.at.items())
+        lines.append(f'    {{ name = "{crossing.name}", at = {{ {at} }} }},')
     return [*lines, "]"]
 
 

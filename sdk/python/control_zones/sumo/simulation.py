@@ -40,6 +40,8 @@ class Totals:
     teleports: int = 0
     departed: int = 0
     arrived: int = 0
+    #: Pairs that collided, with how many of the two were ever driven by acceleration.
+    pairs: dict[tuple[str, str], int] = field(default_factory=dict)
     #: Vehicle-steps, and the wall time of SUMO's own stepping and of all the rest of this package, s.
     vehicle_steps: int = 0
     sumo_s: float = 0.0
@@ -51,7 +53,7 @@ class Totals:
 class Car:
     """A vehicle that is followed."""
 
-    __slots__ = ("advanced_m", "distance_m", "is_driven", "length_m", "name", "number", "path", "seen", "v_mps", "x_m", "zone")
+    __slots__ = ("advanced_m", "beyond", "distance_m", "is_driven", "lane", "length_m", "name", "number", "path", "seen", "v_mps", "x_m", "zone")
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -61,6 +63,8 @@ class Car:
         self.is_driven = False
         #: Where it is a member of a zone: its number there (-1: nowhere), its way, and how far it has come on that, m.
         self.number, self.zone, self.path, self.length_m, self.x_m = -1, 0, 0, 0.0, 0.0
+        #: The lane on which it was seen last outside of zones, or on which it left one; and the same where that zone knows of it.
+        self.lane = self.beyond = ""
 
 
 class Simulation:
@@ -86,11 +90,14 @@ class Simulation:
         #: Those who came into the network in the last step, or back into it, and those who are there no more since.
         self.came: list[str] = []
         self.gone: set[str] = set()
+        #: Who has ever been driven by acceleration.
+        self.driven: set[str] = set()
 
     def hold(self, car: Car, u_mps2: float) -> None:
         """Has a vehicle hold an acceleration over the next step; it stops rather than reverse."""
         if not car.is_driven:
             car.is_driven = True
+            self.driven.add(car.name)
             libsumo.vehicle.setSpeedMode(car.name, OURS)
             libsumo.vehicle.setLaneChangeMode(car.name, NO_CHANGES)
         v_mps = car.v_mps + u_mps2 * self.dt_s
@@ -138,6 +145,8 @@ class Simulation:
         for collision in simulation.getCollisions():
             said = f"{now_s:.1f} s: {collision.collider} and {collision.victim} on {collision.lane} ({collision.type})"
             self.totals.collisions.append(said)
+            pair = (collision.collider, collision.victim)
+            self.totals.pairs[pair] = sum(name in self.driven for name in pair)
         self.totals.vehicle_steps += libsumo.vehicle.getIDCount()
 
     def moves(self, car: Car) -> bool:
