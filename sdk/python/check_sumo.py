@@ -1,13 +1,14 @@
 """Does SUMO play the world as the contract and docs/sumo.md say?
 
 Usage: python3 sdk/python/check_sumo.py [CZ]   (the program `cz`; the one on the path by default)
-Needs the package with its library, and its extra `sumo`. Takes some 40 s.
+Needs the package with its library, and its extra `sumo`. Takes a minute.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import subprocess
 import sys
 import tempfile
@@ -21,7 +22,7 @@ def sumo(*arguments: str) -> dict[str, object]:
     command = [sys.executable, "-m", "control_zones.sumo", *arguments, "--json", "-"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, f"{arguments}: {done.stderr}"
-    found: dict[str, object] = json.loads(done.stdout[done.stdout.index('{\n  "scenario"') :])
+    found: dict[str, object] = json.loads(done.stdout)
     return found
 
 
@@ -89,6 +90,46 @@ def check_networks(folder: Path) -> None:
     print("a grid that netgenerate made: runs, repeats, replays, is imported: passed")
 
 
+def check_grids(folder: Path) -> None:
+    """In a closed grid of five by five, with lights or without, with demand that nobody fitted to it, everybody arrives at every share:
+    nobody waits so long that SUMO takes it out, and no two that are commanded collide."""
+    from control_zones.sumo.simulation import program, sumolib_home
+
+    for name, how in (("plain", []), ("lights", ["-j", "traffic_light"])):
+        net, routes, config = (folder / f"{name}.{kind}" for kind in ("net.xml", "rou.xml", "sumocfg"))
+        grid = [program("netgenerate"), "--grid", "--grid.number", "5", "--grid.length", "150", *how]
+        subprocess.run([*grid, "-o", str(net)], check=True, capture_output=True)
+        trips = [sys.executable, str(Path(sumolib_home()) / "tools" / "randomTrips.py"), "-n", str(net), "-e", "600", "-p", "1.5", "--seed", "1"]
+        surroundings = {**os.environ, "SUMO_HOME": sumolib_home()}
+        subprocess.run([*trips, "-r", str(routes), "-o", str(folder / "trips.xml")], check=True, capture_output=True, env=surroundings)
+        config.write_text(
+            f'<configuration><input><net-file value="{net.name}"/><route-files value="{routes.name}"/></input></configuration>'
+        )
+        means = []
+        for share in ("1", "0.8", "0.5", "0.2"):
+            recording = str(folder / f"{name}-{share}.czlog")
+            summary = sumo("run", str(config), "--penetration", share, "--record", recording)
+            found = summary["sumo"]
+            replayed = subprocess.run([CZ, "replay", recording], capture_output=True, text=True)
+            assert replayed.returncode == 0 and summary["state_hash"] in replayed.stdout, replayed
+            assert found["departed"] == found["arrived"] == 400 and found["teleports"] == 0, (name, share, found)
+            assert share != "1" or found["collided_pairs"] == 0, found
+            means.append(f"{found['mean_travel_s']:.1f}")
+        print(f"a closed grid, {name}: 400 of 400 at 100, 80, 50 and 20 %, mean travel time {', '.join(means)} s: passed")
+
+
+def check_examples() -> None:
+    """SUMO's own examples run as they are, and more vehicles arrive than with SUMO's drivers and lights."""
+    from control_zones.sumo.simulation import sumolib_home
+
+    for name in ("corridor", "cross", "square", "grid6"):
+        config = str(Path(sumolib_home()) / "tools" / "game" / f"{name}.sumocfg")
+        ours, theirs = (sumo("run", config, "--penetration", share)["sumo"] for share in ("1", "0"))
+        assert ours["collided_pairs"] == 0 and ours["teleports"] == 0, (name, ours)
+        assert ours["arrived"] > 1.2 * theirs["arrived"], (name, ours["arrived"], theirs["arrived"])
+        print(f"{name}, of SUMO's examples: {ours['arrived']} arrive, {theirs['arrived']} without automated vehicles: passed")
+
+
 def write_roundabout(folder: Path, radius_m: float) -> Path:
     """A ring of four junctions with four roads, which netconvert is left to recognise as a roundabout; its configuration."""
     from control_zones.sumo.simulation import program
@@ -138,6 +179,52 @@ def check_contract() -> None:
     print("cz world check: passed")
 
 
+def check_stops(folder: Path) -> None:
+    """Who is to stop on its way stops where it is to, and who does not drive as cars do drives by itself, with its own length."""
+    from control_zones.sumo.simulation import program
+
+    net, routes, config = folder / "s.net.xml", folder / "s.rou.xml", folder / "s.sumocfg"
+    grid = [program("netgenerate"), "--grid", "--grid.number", "3", "--grid.length", "200", "--grid.attach-length", "200"]
+    subprocess.run([*grid, "-o", str(net)], check=True, capture_output=True)
+    stop = '<stop lane="left0A0_0" endPos="120" duration="20"/>'
+    routes.write_text(
+        '<routes><vType id="tall" vClass="motorcycle" length="2.2"/><route id="r" edges="left0A0 A0B0 B0C0 C0right0"/>'
+        f'<vehicle id="stops" route="r" depart="0">{stop}</vehicle><vehicle id="rides" type="tall" route="r" depart="60"/>'
+        '<vehicle id="drives" route="r" depart="90"/></routes>'
+    )
+    config.write_text(
+        f'<configuration><input><net-file value="{net.name}"/><route-files value="{routes.name}"/></input>'
+        '<time><begin value="0:0:0"/><end value="0:5:0"/></time></configuration>'
+    )
+    stopped = folder / "stops.xml"
+    found = sumo("run", str(config), f"--sumo=--stop-output={stopped}")
+    assert found["sumo"]["arrived"] == 3 and found["traffic"]["greatest_disobedience_mps2"] < 1e-6, found["traffic"]
+    # The one that stops before the first zone's end, and the motorcycle in each of three.
+    assert found["traffic"]["uncommanded"] == 4, found["traffic"]
+    assert 'pos="120.' in stopped.read_text() or 'pos="119.' in stopped.read_text(), stopped.read_text()
+    print("stops are kept, and times of a configuration read: passed")
+
+
+def check_refusals() -> None:
+    """What cannot be meant is refused in a line that says what was expected."""
+    from control_zones.sumo.simulation import sumolib_home
+
+    config = str(Path(sumolib_home()) / "tools" / "game" / "square.sumocfg")
+    for bad, said in (
+        (["--end", "0"], "--end is 0.0, expected seconds above 0"),
+        (["--approach", "20"], "--approach is 20.0, expected at least"),
+        (["--step-length", "0.0333"], "--step-length is 0.0333 s, expected whole milliseconds"),
+        (["--zone", "A1", "--zone", "A1+B1"], "junction A1 is named twice"),
+        (["--json", "/nowhere/x"], "--json /nowhere/x: No such file"),
+        (["--scenario-out", "/nowhere/x"], "--scenario-out /nowhere/x: No such file"),
+        (["--sumo=--lateral-resolution=0.8"], "lateral-resolution is set"),
+    ):
+        command = [sys.executable, "-m", "control_zones.sumo", "run", config, *bad]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr, (bad, done.stderr)
+    print("what cannot be meant is refused: passed")
+
+
 def check_arrivals(folder: Path) -> None:
     """A trace that comes with the program is made again, and what cannot be meant is refused in a line."""
     out = folder / "arrivals.csv"
@@ -165,9 +252,13 @@ def main() -> None:
     check_scenarios()
     check_mixture()
     check_contract()
+    check_examples()
+    check_refusals()
     with tempfile.TemporaryDirectory(prefix="cz-check-sumo-") as folder:
         check_networks(Path(folder))
+        check_grids(Path(folder))
         check_roundabout(Path(folder))
+        check_stops(Path(folder))
         check_arrivals(Path(folder))
 
 

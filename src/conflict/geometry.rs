@@ -33,9 +33,11 @@ pub struct Use {
     pub at_m: f64,
     /// Extent of the conflict area along the path, m; 0 at a merge.
     pub area_m: f64,
-    /// Where the box begins that the point is in: the points that follow one another so closely that who stands between
-    /// two of them may stand in others' way, m.
+    /// Where the box begins that the point is in, m: the points that follow one another so closely that who stands between
+    /// two of them may stand in others' way, and what is to be kept clear before them.
     pub box_m: f64,
+    /// Where the first of these points is, m.
+    pub first_m: f64,
     /// Lane on which the path passes it: paths that pass it on one lane follow each other there.
     lane: u32,
 }
@@ -170,6 +172,7 @@ impl Conflicts {
             for at in 1..path.uses.len() {
                 let before = path.uses[at - 1];
                 if path.uses[at].at_m - before.at_m < BOX_M {
+                    path.uses[at].first_m = before.first_m;
                     path.uses[at].box_m = path.uses[at].box_m.min(before.box_m);
                 }
             }
@@ -241,7 +244,14 @@ impl Conflicts {
             for (path, own) in zone.paths.iter().zip(&mut self.paths) {
                 let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
                 let at_m = path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
-                own.uses.push(Use { point, at_m, area_m: 0.0, box_m: at_m, lane: path.segments[at - 1] });
+                own.uses.push(Use {
+                    point,
+                    at_m,
+                    area_m: 0.0,
+                    box_m: at_m,
+                    first_m: at_m,
+                    lane: path.segments[at - 1],
+                });
             }
         }
         // Where paths end that leave by one exit and have not come together before.
@@ -254,7 +264,14 @@ impl Conflicts {
             let point = self.point(PointKind::Merge, &shape.name);
             for own in self.paths.iter_mut().filter(|path| path.exit == exit) {
                 let at_m = own.length_m;
-                own.uses.push(Use { point, at_m, area_m: 0.0, box_m: at_m, lane: own.last_segment });
+                own.uses.push(Use {
+                    point,
+                    at_m,
+                    area_m: 0.0,
+                    box_m: at_m,
+                    first_m: at_m,
+                    lane: own.last_segment,
+                });
             }
         }
     }
@@ -268,7 +285,14 @@ impl Conflicts {
                     let before_m: f64 =
                         path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
                     let at_m = before_m + from_m;
-                    own.uses.push(Use { point, at_m, area_m: length_m, box_m: at_m, lane: segment });
+                    own.uses.push(Use {
+                        point,
+                        at_m,
+                        area_m: length_m,
+                        box_m: at_m,
+                        first_m: at_m,
+                        lane: segment,
+                    });
                 }
             }
         }

@@ -57,13 +57,19 @@ pub fn stands_on(conflicts: &Conflicts, inside: &Row, other: &Row) -> bool {
 }
 
 /// Whether a vehicle has entered a box in which another has yet to pass a point that it is not clear of.
+///
+/// Who keeps to no order has entered it with the first point only: before that it still stops for those inside.
 pub fn is_in_the_way(conflicts: &Conflicts, inside: &Row, other: &Row) -> bool {
-    conflicts.uses(inside.path).iter().filter(|own| own.box_m <= inside.x_m).any(|own| {
+    conflicts.uses(inside.path).iter().filter(|own| entered_from_m(inside, own) <= inside.x_m).any(|own| {
         let theirs = conflicts.uses(other.path).iter().find(|u| u.point == own.point);
         let point = &conflicts.points()[own.point as usize];
         inside.x_m < own.at_m + clear_m(point, own, inside.length_m)
             && theirs.is_some_and(|theirs| !theirs.on_lane_of(own) && other.x_m < theirs.at_m)
     })
+}
+
+fn entered_from_m(inside: &Row, passes: &Use) -> f64 {
+    if inside.is_free { passes.first_m } else { passes.box_m }
 }
 
 /// Whether a vehicle has passed every point where it meets another that has not passed all of them.

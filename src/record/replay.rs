@@ -420,7 +420,7 @@ fn difference(own: &Step, recorded: &Step) -> Option<String> {
 }
 
 /// Beyond these no vehicle gets in a scenario that a recording may have.
-const MAX_M: f64 = 1e6;
+const MAX_M: f64 = 1e7;
 const MAX_MPS: f64 = 1e4;
 const MAX_S: f64 = 1e9;
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import shutil
@@ -189,6 +190,23 @@ def junctions(args: argparse.Namespace, folder: str) -> tuple[world.Traffic, Sim
     return made.prepare(args, folder)
 
 
+@contextlib.contextmanager
+def quiet(is_quiet: bool) -> typing.Iterator[None]:
+    """Keeps the run's table off stdout, where only JSON is wanted."""
+    if not is_quiet:
+        yield
+        return
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
 def conduct(
     args: argparse.Namespace, traffic: world.Traffic, simulation: Simulation, run: list[str], folder: str
 ) -> int:
@@ -201,7 +219,8 @@ def conduct(
     began = time.perf_counter()
     simulation.time_calls(traffic)
     try:
-        code = world.run(traffic, run)
+        with quiet(args.json == "-" and run[0] == "run"):
+            code = world.run(traffic, run)
     finally:
         simulation.close()
     totals, wall_s = simulation.totals, time.perf_counter() - began
@@ -224,11 +243,14 @@ def conduct(
         if args.json == "-":
             print(json.dumps(all_of_it, indent=2))
         elif args.json:
-            with open(args.json, "w") as file:
-                json.dump(all_of_it, file, indent=2)
-    if totals.vehicle_steps == 0 and code != 0:
+            try:
+                with open(args.json, "w") as file:
+                    json.dump(all_of_it, file, indent=2)
+            except OSError as error:
+                raise Error(f"--json {args.json}: {error.strerror}") from error
+    if code != 0:
         return code  # It has said why.
-    automated = f" ({said['collided_pairs_automated']} with an automated vehicle)" if totals.pairs else ""
+    automated = f" ({said['collided_pairs_automated']} with one that was commanded)" if totals.pairs else ""
     pairs = "pair" if len(totals.pairs) == 1 else "pairs"
     mean = f", mean travel time {said['mean_travel_s']:.2f} s" if totals.arrived else ""
     print(

@@ -25,6 +25,8 @@ def write(args: argparse.Namespace) -> None:
 
     Raises `Error` when something cannot be read, or written.
     """
+    if not 1.0 <= args.rate <= 10_000.0:
+        raise Error(f"--rate is {args.rate}, expected 1 to 10000 vehicles an hour")
     net = read_net(args.net)
     ids = args.zone or with_conflicts(net)
     zones = [zone_of(net, junction, args.approach) for junction in ids]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 import typing
@@ -12,13 +13,18 @@ import libsumo
 from .._session import Error
 from ..world import GONE, Newcomer, Traffic
 from .importing import limit, slow, with_conflicts
-from .network import Zone, stopping_m, too_short, word, zone_of
+from .network import Zone, members, stopping_m, too_short, word, zone_of
 from .scenario import Kind, text
 from .simulation import Car, Simulation, is_automated, read_net
 
 if typing.TYPE_CHECKING:
     import argparse
     from collections.abc import Iterable, Sequence
+
+
+#: SUMO's vehicle classes that drive as cars do, and those that are no traffic of roads.
+CARS = ("passenger", "private", "taxi", "hov", "evehicle", "delivery", "truck", "trailer", "bus", "coach", "emergency", "authority", "army", "vip", "custom1", "custom2")
+NOT_ON_ROADS = ("pedestrian", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "ship", "container", "cable_car", "aircraft")
 
 
 class Place(typing.NamedTuple):
@@ -131,7 +137,9 @@ class JunctionTraffic(Traffic):
         self.outside[car.name] = car
 
     def is_where(self, car: Car) -> bool:
-        """Whether one is on a lane of its path still."""
+        """Whether one is on a lane of its path still, and not parked beside it."""
+        if car.v_mps == 0.0 and libsumo.vehicle.isStoppedParking(car.name):
+            return False
         place = self.lanes.get(libsumo.vehicle.getLaneID(car.name))
         return place is not None and place.zone == car.zone and any(path == car.path for path, *_ in place.paths)
 
@@ -188,12 +196,12 @@ class JunctionTraffic(Traffic):
         name, place = car.name, self.lanes[lane]
         path, begins_m, is_right = self.choose(name, place)
         x_m, length_m = begins_m + at_m, self.zones[place.zone].paths[path].length_m
-        if not 0.0 <= x_m < length_m:
+        if not 0.0 <= x_m < length_m or libsumo.vehicle.isStoppedParking(name):
             return None
         kind = libsumo.vehicle.getTypeID(name)
         if name not in self.is_automated:
             self.is_automated[name] = self.automated(name, kind)
-        is_commanded = is_right and self.is_automated[name]
+        is_commanded = is_right and self.is_automated[name] and not self.stops(name, place.zone, path)
         self.simulation.see(car)
         if not is_commanded:
             self.simulation.release(car)
@@ -202,6 +210,11 @@ class JunctionTraffic(Traffic):
         del self.outside[name]
         self.count += 1
         return Newcomer(x_m, car.v_mps, place.zone, path, kind=self.kind(kind), is_commanded=int(is_commanded))
+
+    def stops(self, name: str, zone: int, path: int) -> bool:
+        """Whether one is to stop on its way through a zone: then it drives by itself."""
+        stop = libsumo.vehicle.getStops(name, 1)
+        return bool(stop) and any(stop[0].lane == lane for lane, _ in self.zones[zone].paths[path].lanes)
 
     def kind(self, name: str) -> int:
         """The index of a vehicle type; types that come later are as the first."""
@@ -229,10 +242,17 @@ def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation,
         raise Error(f"{args.config}: has no net-file, expected a SUMO configuration")
     net = read_net(os.path.join(os.path.dirname(os.path.abspath(args.config)), named.get("value") or named.get("v") or ""))
     seed = 1 if args.seed is None else args.seed
+    if args.end is not None and not 0.0 < args.end < math.inf:
+        raise Error(f"--end is {args.end}, expected seconds above 0")
     simulation = Simulation(["-c", args.config, *args.sumo], args.step_length, seed)
+    if float(libsumo.simulation.getOption("lateral-resolution") or 0.0) > 0.0:
+        raise Error(f"{args.config}: lateral-resolution is set, expected vehicles in the middle of their lanes")
     ids = suitable(net, args.zone)
     zones = [zone_of(net, junction, args.approach) for junction in ids]
-    kinds, index = fleet()
+    v_max_mps = limit(net, zones)
+    if not stopping_m(v_max_mps) <= args.approach < math.inf:
+        raise Error(f"--approach is {args.approach}, expected at least {stopping_m(v_max_mps):.1f} m, on which vehicles stop from {v_max_mps:.1f} m/s")
+    kinds, index = fleet(v_max_mps)
     if (told := slow(net, zones)) is not None:
         print(f"cz sumo: {told}", file=sys.stderr)
     if args.lights == "off" and args.penetration > 0.0:
@@ -240,10 +260,8 @@ def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation,
     unknown = [name for name in args.cav if name not in index]
     if unknown:
         raise Error(f"--cav: there is no vehicle type {unknown[0]}, expected one of {', '.join(sorted(index))}")
-    ended = root.find(".//end")
-    end_s = args.end or (float(ended.get("value") or ended.get("v") or 0.0) if ended is not None else 0.0)
-    if end_s <= 0.0:
-        end_s = 3600.0
+    span_s = libsumo.simulation.getEndTime() - libsumo.simulation.getTime()
+    end_s = args.end or (span_s if span_s > 0.0 else 3600.0)
     written = text(
         "sumo",
         zones,
@@ -251,17 +269,20 @@ def prepare(args: argparse.Namespace, folder: str) -> tuple[Traffic, Simulation,
         seed=seed,
         dt_s=args.step_length,
         end_s=end_s,
-        v_max_mps=limit(net, zones),
+        v_max_mps=v_max_mps,
         about=f"Junctions of {os.path.basename(args.config)}, made by `cz sumo run`: SUMO brings the vehicles, whatever the roads say.",
     )
     path = args.scenario_out or os.path.join(folder, "sumo.toml")
-    with open(path, "w") as file:
-        file.write(written)
+    try:
+        with open(path, "w") as file:
+            file.write(written)
+    except OSError as error:
+        raise Error(f"--scenario-out {path}: {error.strerror}") from error
 
     def automated(name: str, kind: str) -> bool:
-        return (not args.cav or kind in args.cav) and is_automated(seed, name, args.penetration)
+        return (kind in args.cav if args.cav else is_car(kind)) and is_automated(seed, name, args.penetration)
 
-    traffic = JunctionTraffic(zones, index, simulation, automated, limit(net, zones))
+    traffic = JunctionTraffic(zones, index, simulation, automated, v_max_mps)
     return traffic, simulation, ["run", path, "--in-process", *(f"--set={one}" for one in args.set)]
 
 
@@ -282,25 +303,37 @@ def switch_off(zones: Sequence[Zone]) -> None:
 def suitable(net: typing.Any, named: list[str]) -> list[str]:
     """The junctions that become zones: those that are named, or all that can.
 
-    Raises `Error` when one that is named cannot, or none can.
+    Raises `Error` when one that is named cannot, or is so twice, or none can.
     """
+    nodes = [node for junction in named for node in members(net, junction)]
+    twice = next((node for node in nodes if nodes.count(node) > 1), None)
+    if twice is not None:
+        raise Error(f"--zone: junction {twice} is named twice, expected each in one zone")
     reasons = {junction: too_short(net, junction) for junction in named or with_conflicts(net)}
     bad = [reason for reason in reasons.values() if reason]
-    if bad and (named or len(bad) == len(reasons)):
+    if bad and named:
         raise Error(f"--zone: {bad[0]}: vehicles could not stop between junctions")
+    if bad and len(bad) == len(reasons):
+        raise Error(f"no junction of the network can be a zone: {bad[0]}, and likewise the others")
     for reason in bad:
         print(f"cz sumo: left to SUMO: {reason}", file=sys.stderr)
     return [junction for junction in named or reasons if reasons.get(junction) is None]
 
 
-def fleet() -> tuple[list[Kind], dict[str, int]]:
+def is_car(kind: str) -> bool:
+    """Whether vehicles of a type are automated where nobody says which are: those that drive as cars do."""
+    return libsumo.vehicletype.getVehicleClass(kind) in CARS
+
+
+def fleet(v_max_mps: float) -> tuple[list[Kind], dict[str, int]]:
     """Kinds for the vehicle types that SUMO knows; types alike in what matters here are one kind."""
     kinds: list[Kind] = []
     index: dict[str, int] = {}
     types = libsumo.vehicletype
     for name in sorted(types.getIDList(), key=lambda name: (name != "DEFAULT_VEHTYPE", name)):
-        kind = Kind(word(name), types.getLength(name), -types.getDecel(name), types.getAccel(name))
-        if types.getVehicleClass(name) not in ("passenger", "truck", "bus", "delivery", "trailer", "private", "taxi"):
+        fastest_mps = min(types.getMaxSpeed(name), v_max_mps)
+        kind = Kind(word(name), types.getLength(name), -types.getDecel(name), types.getAccel(name), fastest_mps)
+        if types.getVehicleClass(name) in NOT_ON_ROADS:
             continue
         same = next((at for at, known in enumerate(kinds) if known[1:] == kind[1:]), None)
         if same is None:

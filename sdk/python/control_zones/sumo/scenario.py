@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import typing
 
 if typing.TYPE_CHECKING:
@@ -21,6 +22,8 @@ class Kind(typing.NamedTuple):
     length_m: float
     u_min_mps2: float
     u_max_mps2: float
+    #: Where it is below that of the roads.
+    v_max_mps: float = math.inf
 
 
 def text(
@@ -59,7 +62,9 @@ def text(
     if len(kinds) > 1:
         for kind in kinds:
             lines += ["[[fleet]]", f'name = "{kind.name}"', f"share = {1.0 / len(kinds)!r}"]
-            lines += [f"{key} = {value!r}" for key, value in limits(kind)] + [""]
+            lines += [f"{key} = {value!r}" for key, value in limits(kind)]
+            lines += [f"v_max_mps = {kind.v_max_mps!r}"] if kind.v_max_mps < v_max_mps else []
+            lines += [""]
     for road in (segment.road for zone in zones for segment in zone.segments if segment.road):
         lines += ["[[roads]]", f'name = "{road}"', *demand((rates or {}).get(road), end_s, speed_mps, v_max_mps), ""]
     for zone in zones:

@@ -40,7 +40,7 @@ class Totals:
     teleports: int = 0
     departed: int = 0
     arrived: int = 0
-    #: Pairs that collided, with how many of the two were ever driven by acceleration.
+    #: Pairs that collided, with how many of the two were driven by acceleration then.
     pairs: dict[tuple[str, str], int] = field(default_factory=dict)
     #: Vehicle-steps, and the wall time of SUMO's own stepping and of all the rest of this package, s.
     vehicle_steps: int = 0
@@ -74,6 +74,9 @@ class Simulation:
     """
 
     def __init__(self, options: Sequence[str], dt_s: float, seed: int) -> None:
+        milliseconds = 1e3 * dt_s
+        if not (1.0 <= milliseconds <= 1e3 and abs(milliseconds - round(milliseconds)) < 1e-6):
+            raise Error(f"--step-length is {dt_s} s, expected whole milliseconds up to 1 s: SUMO's time has no others")
         home = sumolib_home()
         os.environ.setdefault("SUMO_HOME", home)
         own = ["--step-length", repr(dt_s), "--step-method.ballistic", "true", "--seed", str(seed)]
@@ -90,7 +93,7 @@ class Simulation:
         #: Those who came into the network in the last step, or back into it, and those who are there no more since.
         self.came: list[str] = []
         self.gone: set[str] = set()
-        #: Who has ever been driven by acceleration.
+        #: Who is driven by acceleration.
         self.driven: set[str] = set()
 
     def hold(self, car: Car, u_mps2: float) -> None:
@@ -111,6 +114,7 @@ class Simulation:
         """Leaves a vehicle to SUMO's own driver, with these of its checks."""
         if car.is_driven:
             car.is_driven = False
+            self.driven.discard(car.name)
             if car.name not in self.gone:
                 libsumo.vehicle.setSpeed(car.name, -1.0)
                 libsumo.vehicle.setSpeedMode(car.name, mode)
@@ -146,7 +150,7 @@ class Simulation:
             said = f"{now_s:.1f} s: {collision.collider} and {collision.victim} on {collision.lane} ({collision.type})"
             self.totals.collisions.append(said)
             pair = (collision.collider, collision.victim)
-            self.totals.pairs[pair] = sum(name in self.driven for name in pair)
+            self.totals.pairs.setdefault(pair, sum(name in self.driven for name in pair))
         self.totals.vehicle_steps += libsumo.vehicle.getIDCount()
 
     def moves(self, car: Car) -> bool:
