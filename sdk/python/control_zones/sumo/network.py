@@ -109,10 +109,11 @@ def zone_of(net: typing.Any, junction: str, approach_m: float) -> Zone:
     for edge in incoming(net, junction):
         for lane in edge.getLanes():
             add_lane(net, zone, lane, approach_m, nodes, inner)
-    # In a ring, whoever waits before a junction is in the way of those who leave by the one before.
+    # Between junctions of a ring, whoever waits before one is in the way of those who leave by the one before.
     rings = {str(node) for ring in net.getRoundabouts() for node in ring.getNodes()}
-    for segment in zone.segments:
-        segment.keep_clear = segment.keep_clear and not nodes & rings
+    if len(nodes) == 1 and nodes <= rings:
+        for segment in zone.segments:
+            segment.keep_clear = False
     if not zone.paths:
         raise Error(f"--zone: vehicles cannot cross junction {junction}: no connection of it is for passenger cars")
     zone.crossings = crossings(zone, inner)
