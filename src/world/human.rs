@@ -7,9 +7,9 @@
 use super::car::Car;
 use super::faults::{Draws, Purpose};
 use super::role::World;
-use crate::conflict::{Conflicts, clear_m, line_before_m};
+use crate::conflict::{Conflicts, Use, clear_m, line_before_m};
 use crate::lists::Lists;
-use crate::scenario::{HumanParams, Scenario, Source, VehicleParams, Yielding};
+use crate::scenario::{HumanParams, Scenario, Source, VehicleKind, VehicleParams, Yielding};
 use crate::vehicle::driver::{Ahead, reach_s, safe_mps2, wish_mps2};
 use std::collections::{BTreeMap, VecDeque};
 
@@ -25,10 +25,19 @@ const CREEPING_MPS: f64 = 0.1;
 const BRAKING_MPS2: f64 = 0.5;
 /// Time that whoever starts gives those that come to notice it: until it moves, and their reaction, s.
 const LOOKING_S: f64 = 1.0;
+/// Whoever is seen to brake for so long does not only waver, s.
+const BRAKES_S: f64 = 0.5;
+/// So many times as long as patience lasts and to notice takes is the turn of one of two that stand.
+const TURN: f64 = 2.0;
 /// Between errors of one driver's acceleration, s.
 const NOISE_S: f64 = 1.0;
 /// How long one brakes for no reason, s.
 const SCARE_S: f64 = 2.0;
+
+/// Whether drivers of a kind go by how long others have stood.
+fn goes_by_standing(kind: &VehicleKind) -> bool {
+    kind.human.is_some_and(|human| human.yields == Yielding::Gap)
+}
 
 /// The human drivers of a run.
 #[derive(Debug)]
@@ -41,6 +50,10 @@ pub(super) struct Humans {
     ranks: Lists<u32>,
     /// Place in the passing order by car of the zone that is looked at.
     places: Vec<u32>,
+    /// How long vehicles have stood and braked, if there are drivers who go by it.
+    stood: Option<BTreeMap<u32, Stood>>,
+    /// The same by car of the zone that is looked at.
+    stands: Vec<Stood>,
     dt_s: f64,
     longest_m: f64,
 }
@@ -57,6 +70,17 @@ struct Mind {
     seen: VecDeque<Seen>,
     /// Most that is remembered.
     delay: usize,
+}
+
+/// For how many steps a vehicle has stood or braked: whoever looks on can see it.
+#[derive(Clone, Copy, Debug, Default)]
+struct Stood {
+    /// Has stood since it drove last.
+    queued: u64,
+    /// Has stood without a break.
+    still: u64,
+    /// Has braked without a break.
+    brakes: u64,
 }
 
 /// What is to be seen in one step, in the coordinate that grows on.
@@ -92,8 +116,10 @@ struct Scene<'a> {
     cars: &'a [Car],
     kinds: &'a [VehicleParams],
     places: &'a [u32],
+    stands: &'a [Stood],
     ranks: &'a [u32],
     longest_m: f64,
+    dt_s: f64,
 }
 
 impl Humans {
@@ -121,6 +147,8 @@ impl Humans {
             draws: Draws::of(scenario.seed),
             ranks,
             places: Vec::new(),
+            stood: scenario.fleet.iter().any(goes_by_standing).then(BTreeMap::new),
+            stands: Vec::new(),
             dt_s: scenario.dt_s(),
             longest_m: scenario.fleet.iter().map(|kind| kind.vehicle.length_m).fold(0.0, f64::max),
         }))
@@ -144,6 +172,28 @@ impl Humans {
     /// A vehicle has left the network.
     pub(super) fn forget(&mut self, vehicle: u32) {
         self.minds.remove(&vehicle);
+        if let Some(stood) = &mut self.stood {
+            stood.remove(&vehicle);
+        }
+    }
+
+    /// Notes who of a zone's vehicles stands or brakes.
+    fn watch(&mut self, cars: &[Car], first: usize) {
+        self.stands.clear();
+        self.stands.resize(cars.len(), Stood::default());
+        let Some(all) = &mut self.stood else { return };
+        for (car, noted) in cars[first..].iter().zip(&mut self.stands[first..]) {
+            let stood = all.entry(car.vehicle).or_default();
+            let stands = car.v_mps < STANDING_MPS;
+            stood.still = if stands { stood.still + 1 } else { 0 };
+            stood.brakes = if car.u_mps2 < -BRAKING_MPS2 { stood.brakes + 1 } else { 0 };
+            if car.v_mps > DRIVING_MPS {
+                stood.queued = 0
+            } else {
+                stood.queued += u64::from(stands)
+            }
+            *noted = *stood;
+        }
     }
 
     fn mind(&mut self, car: &Car, human: &HumanParams, v_max_mps: f64) -> &mut Mind {
@@ -174,7 +224,8 @@ impl Humans {
             mind.stands = 0;
         }
         let waited_s = mind.stands as f64 * dt_s;
-        let driver = Driver { human, car, desired_mps: mind.desired_mps, waited_s, vehicle };
+        let stood = scene.stands[at];
+        let driver = Driver { human, car, desired_mps: mind.desired_mps, waited_s, stood, vehicle };
         let base_m = mind.base_m;
         let mut seen = scene.look(&driver, at);
         seen.leaders.iter_mut().flatten().for_each(|ahead| ahead.rear_m += base_m);
@@ -216,6 +267,7 @@ struct Driver<'a> {
     vehicle: &'a VehicleParams,
     desired_mps: f64,
     waited_s: f64,
+    stood: Stood,
 }
 
 /// Two vehicles at a point that both are to pass: distances to it, m.
@@ -282,6 +334,15 @@ impl Scene<'_> {
                 if other.x_m >= theirs.at_m {
                     return true;
                 }
+                let stood = self.stands[index];
+                // Of a queue only the first can come.
+                if human.yields == Yielding::Gap
+                    && driver.stood.queued > 0
+                    && stood.queued > 0
+                    && self.is_behind_another(other, theirs)
+                {
+                    return false;
+                }
                 let meeting = Meeting {
                     own_m: own.at_m - car.x_m,
                     other_m: theirs.at_m - other.x_m,
@@ -291,7 +352,7 @@ impl Scene<'_> {
                 };
                 match human.yields {
                     Yielding::Order => self.places[index] < self.places[at],
-                    Yielding::Priority | Yielding::Gap => self.gives_way(driver, other, &meeting),
+                    Yielding::Priority | Yielding::Gap => self.gives_way(driver, other, stood, &meeting),
                 }
             });
             if waits {
@@ -305,13 +366,47 @@ impl Scene<'_> {
         None
     }
 
+    /// Whether a driver has the right of way over another.
+    ///
+    /// Without ranks, of two that have queued the one whose patience has ended goes before the one whose patience has not,
+    /// and otherwise who came first. Each grants it to the other by what is to be seen, and takes it for itself only
+    /// when the other must have noticed: so they never both have it.
+    fn has_way(&self, driver: &Driver<'_>, other: &Car, seen: Stood) -> bool {
+        let Driver { human, car, stood, .. } = *driver;
+        let came = |car: &Car| (car.entry_time_s, car.vehicle);
+        let came_first = came(car) < came(other);
+        if human.yields != Yielding::Gap {
+            let [own, theirs] = [car, other].map(|car| self.ranks[car.path as usize]);
+            return own > theirs || own == theirs && came_first;
+        }
+        let notices_s = human.delay_s + LOOKING_S;
+        let has_ended = self.lasts_s(stood.queued) >= human.patience_s + notices_s;
+        let theirs_has_ended = self.lasts_s(seen.queued) >= human.patience_s;
+        // Whoever came first and yet stands still has its turn, then the other has, and so on: there may be reasons for it that
+        // no rule between the two knows of.
+        let first = if came_first { stood } else { seen };
+        let turn_s = TURN * (human.patience_s + notices_s);
+        let turns = self.lasts_s(first.still) / turn_s;
+        let turn = turns as u64;
+        if turn > 0 {
+            let is_own = came_first == turn.is_multiple_of(2);
+            return is_own && (turns - turn as f64) * turn_s >= notices_s;
+        }
+        match came_first {
+            true => has_ended || !theirs_has_ended || stood.queued == 0,
+            false => has_ended && !theirs_has_ended && self.lasts_s(seen.queued) >= notices_s,
+        }
+    }
+
+    fn lasts_s(&self, steps: u64) -> f64 {
+        steps as f64 * self.dt_s
+    }
+
     /// Whether a driver that does not follow the passing order lets another go first.
-    fn gives_way(&self, driver: &Driver<'_>, other: &Car, meeting: &Meeting) -> bool {
+    fn gives_way(&self, driver: &Driver<'_>, other: &Car, seen: Stood, meeting: &Meeting) -> bool {
         let Driver { human, car, desired_mps, waited_s, .. } = *driver;
-        let rank = |car: &Car| if human.yields == Yielding::Gap { 0 } else { self.ranks[car.path as usize] };
-        let comes_first = (rank(other), other.entry_time_s, other.vehicle);
-        let has_way = rank(car) > comes_first.0
-            || rank(car) == comes_first.0 && (car.entry_time_s, car.vehicle) < (comes_first.1, comes_first.2);
+        let is_gap = human.yields == Yielding::Gap;
+        let has_way = self.has_way(driver, other, seen);
         let Meeting { own_m, other_m, other_box_m, is_inside, clear_m } = *meeting;
         if !is_inside && other_box_m <= 0.0 {
             // It is in the midst of it.
@@ -324,8 +419,16 @@ impl Scene<'_> {
             true => other_m / other.v_mps.max(CREEPING_MPS),
             false => reach_s(other_m, other.v_mps, desired_mps, human.acceleration_mps2),
         };
-        let is_patient = waited_s < human.patience_s || other.v_mps >= STANDING_MPS;
-        let drives = other.v_mps >= STANDING_MPS && other.u_mps2 > -BRAKING_MPS2;
+        let comfortable_m = |v_mps: f64| v_mps * v_mps / (2.0 * human.comfortable_mps2);
+        let mut is_patient = waited_s < human.patience_s || other.v_mps >= STANDING_MPS;
+        let mut means_to_stop = other.u_mps2 <= -BRAKING_MPS2;
+        if is_gap {
+            // Patience is in the right of way.
+            is_patient = true;
+            means_to_stop =
+                self.lasts_s(seen.brakes) >= BRAKES_S && comfortable_m(other.v_mps) <= other_box_m;
+        }
+        let drives = other.v_mps >= STANDING_MPS && !means_to_stop;
         if is_inside && other_box_m <= 0.0 {
             // Both have entered, at the same instant perhaps. What the other does is to be seen: nobody drives on into one that
             // does, whoever has the way; and of two that stand the one that has it goes, or whom the other is in the way of.
@@ -338,10 +441,19 @@ impl Scene<'_> {
                 }
             };
         }
-        if has_way && !is_inside && drives && car.v_mps < DRIVING_MPS {
+        let looks = has_way && !is_inside && car.v_mps < DRIVING_MPS;
+        if looks && is_gap && other.v_mps > 0.0 && other.u_mps2 > 0.0 {
+            // One that is starting next to the point is over it before it could notice.
+            let over_m = (other.v_mps + 0.5 * human.acceleration_mps2 * LOOKING_S) * LOOKING_S;
+            if over_m > other_box_m && comes_s < clears_s {
+                return true;
+            }
+        }
+        if looks && drives {
             // Whoever has stood looks before it starts whether those that show no sign of stopping still can without haste.
-            let stops_m =
-                other.v_mps * LOOKING_S + other.v_mps * other.v_mps / (2.0 * human.comfortable_mps2);
+            let gains_mps = if is_gap { other.u_mps2.max(0.0) * LOOKING_S } else { 0.0 };
+            let later_mps = other.v_mps + gains_mps;
+            let stops_m = (other.v_mps + 0.5 * gains_mps) * LOOKING_S + comfortable_m(later_mps);
             return stops_m > other_box_m && comes_s < clears_s;
         }
         let braking_mps2 = -self.kinds[usize::from(other.kind)].u_min_mps2;
@@ -352,6 +464,17 @@ impl Scene<'_> {
             return !stops && comes_s < clears_s;
         }
         comes_s - clears_s < human.critical_gap_s && is_patient
+    }
+
+    /// Whether somebody drives ahead of a vehicle on its lane up to a conflict point.
+    fn is_behind_another(&self, other: &Car, theirs: &Use) -> bool {
+        self.cars.iter().any(|car| {
+            let own = self.conflicts.uses(car.path).iter().find(|u| u.point == theirs.point);
+            own.is_some_and(|own| {
+                let left_m = own.at_m - car.x_m;
+                own.on_lane_of(theirs) && left_m > 0.0 && left_m < theirs.at_m - other.x_m
+            })
+        })
     }
 
     /// Whether a vehicle is on a conflict point that another has yet to pass.
@@ -375,12 +498,14 @@ impl World {
             if !self.cars[zone][first..].iter().any(|car| !car.is_commanded) {
                 continue;
             }
+            humans.watch(&self.cars[zone], first);
             // Those that have left come first.
             let mut places = std::mem::take(&mut humans.places);
             places.clear();
             places.resize(self.cars[zone].len(), 0);
             (1..).zip(&self.order[zone]).for_each(|(place, at)| places[*at as usize] = place);
             let ranks = std::mem::replace(&mut humans.ranks, Lists::new(0));
+            let stands = std::mem::take(&mut humans.stands);
             for at in first..self.cars[zone].len() {
                 let Some(human) = humans.drivers[usize::from(self.cars[zone][at].kind)] else { continue };
                 let scene = Scene {
@@ -388,13 +513,15 @@ impl World {
                     cars: &self.cars[zone],
                     kinds: &self.kinds,
                     places: &places,
+                    stands: &stands,
                     ranks: &ranks[zone],
+                    dt_s: humans.dt_s,
                     longest_m: humans.longest_m,
                 };
                 let u_mps2 = humans.decide(&scene, at, &human, self.step);
                 self.cars[zone][at].command_mps2 = u_mps2;
             }
-            (humans.places, humans.ranks) = (places, ranks);
+            (humans.places, humans.ranks, humans.stands) = (places, ranks, stands);
         }
         self.humans = Some(humans);
     }

@@ -115,6 +115,33 @@ fn nobody_starts_into_another() {
     }
 }
 
+/// Where no rank says who goes first, nobody starts together with one that stands beside it. Each of these runs had bodies that
+/// overlapped, and that with scares never ended; but the last: three that wait for each other enter a box there and never get out, if they may start together
+/// once they have waited long enough.
+#[test]
+fn nobody_starts_together_with_another() {
+    let runs = [
+        ("two-merges", 0.2, "desired_sd_mps=1", 1),
+        ("two-merges", 0.2, "desired_sd_mps=1", 3),
+        ("two-merges", 0.2, "desired_sd_mps=1", 4),
+        ("two-merges", 0.5, "desired_sd_mps=1", 2),
+        ("two-merges", 0.5, "desired_sd_mps=1", 5),
+        ("intersection", 0.0, "desired_sd_mps=1", 3),
+        ("roundabout", 0.5, "desired_sd_mps=1", 1),
+        ("two-merges", 0.5, "desired_sd_mps=1, scares_per_h=10", 7),
+        ("intersection", 0.5, "desired_sd_mps=0", 11),
+    ];
+    for (network, automated, human, seed) in runs {
+        let rate = NETWORKS.iter().find(|(name, _)| *name == network).unwrap().1;
+        let human = format!("yields=\"gap\", {human}");
+        let summary = built_in(&mixed(network, automated, &human, rate, 150, seed));
+        let row = &summary.shield.controllers[0];
+        let what = format!("{network}, {automated}, seed {seed}: {:?}", summary.overlaps);
+        assert_eq!((summary.departed, summary.waiting), (150, 0), "{what}");
+        assert_eq!((summary.overlaps.pairs, row.lost), (0, 0), "{what}");
+    }
+}
+
 /// Drives the automated ones with an adversary until so many steps of vehicles, humans and others, have passed.
 fn attack(
     scenario: &Arc<Scenario>,
