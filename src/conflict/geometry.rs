@@ -244,14 +244,7 @@ impl Conflicts {
             for (path, own) in zone.paths.iter().zip(&mut self.paths) {
                 let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
                 let at_m = path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
-                own.uses.push(Use {
-                    point,
-                    at_m,
-                    area_m: 0.0,
-                    box_m: at_m,
-                    first_m: at_m,
-                    lane: path.segments[at - 1],
-                });
+                own.uses.push(Use::new(point, at_m, 0.0, path.segments[at - 1]));
             }
         }
         // Where paths end that leave by one exit and have not come together before.
@@ -263,15 +256,7 @@ impl Conflicts {
             }
             let point = self.point(PointKind::Merge, &shape.name);
             for own in self.paths.iter_mut().filter(|path| path.exit == exit) {
-                let at_m = own.length_m;
-                own.uses.push(Use {
-                    point,
-                    at_m,
-                    area_m: 0.0,
-                    box_m: at_m,
-                    first_m: at_m,
-                    lane: own.last_segment,
-                });
+                own.uses.push(Use::new(point, own.length_m, 0.0, own.last_segment));
             }
         }
     }
@@ -284,15 +269,7 @@ impl Conflicts {
                     let Some(at) = path.segments.iter().position(|&s| s == segment) else { continue };
                     let before_m: f64 =
                         path.segments[..at].iter().map(|&s| zone.segments[s as usize].length_m).sum();
-                    let at_m = before_m + from_m;
-                    own.uses.push(Use {
-                        point,
-                        at_m,
-                        area_m: length_m,
-                        box_m: at_m,
-                        first_m: at_m,
-                        lane: segment,
-                    });
+                    own.uses.push(Use::new(point, before_m + from_m, length_m, segment));
                 }
             }
         }
@@ -404,6 +381,11 @@ impl Conflicts {
 }
 
 impl Use {
+    /// A passage in a box of its own.
+    fn new(point: u32, at_m: f64, area_m: f64, lane: u32) -> Use {
+        Use { point, at_m, area_m, box_m: at_m, first_m: at_m, lane }
+    }
+
     /// The lane on which the path passes the point.
     pub(super) fn lane(&self) -> u32 {
         self.lane

@@ -24,7 +24,7 @@ if typing.TYPE_CHECKING:
 
 #: SUMO's vehicle classes that drive as cars do, and those that are no traffic of roads.
 CARS = ("passenger", "private", "taxi", "hov", "evehicle", "delivery", "truck", "trailer", "bus", "coach", "emergency", "authority", "army", "vip", "custom1", "custom2")
-NOT_ON_ROADS = ("pedestrian", "rail", "rail_urban", "rail_electric", "rail_fast", "subway", "ship", "container", "cable_car", "aircraft")
+NOT_ON_ROADS = ("pedestrian", "rail", "rail_electric", "rail_fast", "subway", "ship", "container", "cable_car", "aircraft")
 
 
 class Place(typing.NamedTuple):
@@ -176,7 +176,10 @@ class JunctionTraffic(Traffic):
             if not on_it:
                 continue
             name = min(on_it, key=position_of)
-            car, at_m = known[name], position_of(name)
+            car, at_m = known.get(name), position_of(name)
+            if car is None:
+                # It was there before the first step.
+                car = self.outside[name] = Car(name)
             if car.beyond == lane or (car.number >= 0 and self.zones[car.zone].paths[car.path].lanes[-1][0] == lane):
                 continue
             car.lane = car.beyond = lane
