@@ -15,6 +15,7 @@ mod scope;
 mod sections;
 pub(super) mod table;
 mod topology;
+mod zone;
 
 pub use error::{Place, ScenarioError, printable};
 pub use overrides::Override;

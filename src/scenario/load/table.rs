@@ -377,3 +377,21 @@ pub(in crate::scenario) fn unique_names<'a>(
     }
     Ok(names)
 }
+
+/// Index of the name a field gives.
+pub(super) fn find(field: &Field<'_>, what: &str, names: &[&str]) -> Result<usize, ScenarioError> {
+    let expected = || {
+        let article = if what.starts_with(['a', 'e', 'i', 'o', 'u']) { "an" } else { "a" };
+        let word = field.str("").unwrap_or("");
+        let hint = nearest(word, names.iter().copied());
+        let hint = hint.map(|h| format!("; did you mean {h}?")).unwrap_or_default();
+        let mut list = names.iter().take(20).copied().collect::<Vec<_>>().join(", ");
+        if names.len() > 20 {
+            list += ", ...";
+        }
+        format!("the name of {article} {what}: {list}{hint}")
+    };
+    let name = field.str("").map_err(|_| field.bad(&expected()))?;
+    let found = names.iter().position(|n| *n == name);
+    found.ok_or_else(|| field.bad_because(Some(format!("unknown {what}")), &expected()))
+}
