@@ -37,11 +37,10 @@ class Place(typing.NamedTuple):
 
 
 class Exit(typing.NamedTuple):
-    """A lane out of a zone: one of the paths that lead to it, and for how many metres those that leave must see who is on it."""
+    """A lane out of a zone, and one of the paths that lead to it."""
 
     zone: int
     path: int
-    near_m: float
 
 
 class JunctionTraffic(Traffic):
@@ -61,11 +60,12 @@ class JunctionTraffic(Traffic):
         self.zones, self.kinds, self.simulation, self.automated = zones, kinds, simulation, automated
         self.lanes: dict[str, Place] = {}
         self.exits: dict[str, list[Exit]] = {}
-        near_m = stopping_m(v_max_mps)
+        #: For so many metres behind an exit those that leave must see who is there.
+        self.near_m = stopping_m(v_max_mps)
         for index, zone in enumerate(zones):
             out = {path.lanes[-1][0]: number for number, path in enumerate(zone.paths)}
             for lane, number in out.items():
-                self.exits.setdefault(lane, []).append(Exit(index, number, near_m))
+                self.exits.setdefault(lane, []).append(Exit(index, number))
             over: dict[str, list[tuple[int, float, tuple[str, ...]]]] = {}
             for number, path in enumerate(zone.paths):
                 for at, (lane, at_m) in enumerate(path.lanes[:-1]):
@@ -184,13 +184,15 @@ class JunctionTraffic(Traffic):
                 continue
             car.lane = car.beyond = lane
             self.simulation.see(car)
-            for zone, path, near_m in self.exits[lane]:
-                if at_m < near_m:
-                    self.left.add(self.count)
-                    self.cars[self.count] = car
-                    self.count += 1
-                    x_m, kind = self.zones[zone].paths[path].length_m + at_m, self.kind(libsumo.vehicle.getTypeID(name))
-                    found.append(Newcomer(x_m, car.v_mps, zone, path, kind=kind, is_commanded=0))
+            if at_m >= self.near_m:
+                continue
+            kind = self.kind(libsumo.vehicle.getTypeID(name))
+            for zone, path in self.exits[lane]:
+                self.left.add(self.count)
+                self.cars[self.count] = car
+                self.count += 1
+                x_m = self.zones[zone].paths[path].length_m + at_m
+                found.append(Newcomer(x_m, car.v_mps, zone, path, kind=kind, is_commanded=0))
         self.unsure.clear()
         return found
 
